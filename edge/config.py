@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of every stage as frozen dataclasses: units in the names, defaults that work, values checked on construction.
+
+``edge/rig.py`` fills them from TOML. A stage takes exactly its own group and nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from edge.errors import ConfigError
+
+WindowName = Literal["rectangular", "hann"]
+CfarKind = Literal["ca", "os"]
+WINDOWS: tuple[WindowName, ...] = ("rectangular", "hann")
+CFAR_KINDS: tuple[CfarKind, ...] = ("ca", "os")
+
+
+def require(condition: bool, key: str, value: object, allowed: str, action: str = "") -> None:
+    """Raise ConfigError for setting ``key`` unless ``condition`` holds."""
+    if not condition:
+        raise ConfigError(f"setting {key} cannot work", value=value, allowed=allowed, action=action)
+
+
+@dataclass(frozen=True, slots=True)
+class HeatmapSettings:
+    """Raw samples to range-angle power.
+
+    Args:
+        range_window, angle_window: tapers before the range and the angle FFT.
+        angle_bins: length of the angle FFT over the filled array (one period of the direction cosine).
+        focus: compensate the spherical wavefront at every range bin (simulator physics: needed below 2 D^2 / lambda = 14 m).
+        loops: loops summed coherently; 0 = as many as the ego speed allows, never more than it does.
+        max_saturated_share: share of samples at the ADC's rails above which a frame is refused.
+    """
+
+    range_window: WindowName = "hann"
+    angle_window: WindowName = "hann"
+    angle_bins: int = 256
+    focus: bool = True
+    loops: int = 0
+    max_saturated_share: float = 0.01
+
+    def __post_init__(self) -> None:
+        require(self.range_window in WINDOWS, "heatmap.range_window", self.range_window, ", ".join(WINDOWS))
+        require(self.angle_window in WINDOWS, "heatmap.angle_window", self.angle_window, ", ".join(WINDOWS))
+        power_of_two = self.angle_bins > 0 and self.angle_bins & (self.angle_bins - 1) == 0
+        require(
+            power_of_two and 64 <= self.angle_bins <= 4096,
+            "heatmap.angle_bins",
+            self.angle_bins,
+            "power of two, 64..4096",
+        )
+        require(self.loops >= 0, "heatmap.loops", self.loops, ">= 0 (0 = automatic)")
+        require(0 < self.max_saturated_share <= 1, "heatmap.max_saturated_share", self.max_saturated_share, "0..1")
+
+
+@dataclass(frozen=True, slots=True)
+class CfarSettings:
+    """2-D constant false-alarm rate detection on the periodic angle axis.
+
+    Args:
+        kind: cell averaging or ordered statistic.
+        p_fa: designed false-alarm probability per cell, on exponentially distributed power.
+        guard_range, guard_angle: half widths of the guard box in bins.
+        train_range, train_angle: half widths of the training box in bins; the ring between them is the neighbourhood.
+        os_quantile: rank of the ordered statistic as a share of the ring's cells.
+        min_range_m: cells nearer are not tested (transmit leakage).
+        max_detections: strongest kept per radar and frame.
+    """
+
+    kind: CfarKind = "ca"
+    p_fa: float = 1e-6
+    guard_range: int = 2
+    guard_angle: int = 2
+    train_range: int = 8
+    train_angle: int = 8
+    os_quantile: float = 0.75
+    min_range_m: float = 0.6
+    max_detections: int = 512
+
+    def __post_init__(self) -> None:
+        require(self.kind in CFAR_KINDS, "cfar.kind", self.kind, ", ".join(CFAR_KINDS))
+        require(0.0 < self.p_fa < 0.5, "cfar.p_fa", self.p_fa, "0 < p_fa < 0.5")
+        for axis in ("range", "angle"):
+            guard, train = getattr(self, f"guard_{axis}"), getattr(self, f"train_{axis}")
+            require(
+                0 <= guard < train <= 32,
+                f"cfar.guard_{axis}, cfar.train_{axis}",
+                (guard, train),
+                "0 <= guard < train <= 32",
+            )
+        require(0.0 < self.os_quantile < 1.0, "cfar.os_quantile", self.os_quantile, "between 0 and 1")
+        require(self.min_range_m >= 0, "cfar.min_range_m", self.min_range_m, ">= 0")
+        require(self.max_detections > 0, "cfar.max_detections", self.max_detections, "> 0")
+
+
+@dataclass(frozen=True, slots=True)
+class AntennaSettings:
+    """One-way element pattern, loss in dB = loss_db * (angle / edge)^2, at most max_loss_db. No board has confirmed the level.
+
+    Args:
+        along_edge_deg, along_loss_db: in the plane of the radar's own array.
+        across_edge_deg, across_loss_db: in the other plane.
+        max_loss_db: one-way cap.
+    """
+
+    along_edge_deg: float = 70.0
+    along_loss_db: float = 6.0
+    across_edge_deg: float = 20.0
+    across_loss_db: float = 6.0
+    max_loss_db: float = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class AssociationSettings:
+    """Pairing of both radars' detections and the region that is kept.
+
+    Args:
+        max_discrepancy_db: unequal counts: pair strongest first and stop beyond this (paper: 3 dB).
+        range_gate_bins: largest difference of the two corrected ranges, in range bins, to count as the same bin.
+        fov_deg: largest angle off boresight along each array (paper: 45).
+        max_height_m: points higher above the ground are removed (paper: 3).
+        ground_margin_m: points lower than this above the ground are removed; negative keeps some below.
+    """
+
+    max_discrepancy_db: float = 3.0
+    range_gate_bins: float = 0.5
+    fov_deg: float = 45.0
+    max_height_m: float = 3.0
+    ground_margin_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.max_discrepancy_db > 0, "association.max_discrepancy_db", self.max_discrepancy_db, "> 0")
+        require(self.range_gate_bins > 0, "association.range_gate_bins", self.range_gate_bins, "> 0")
+        require(0 < self.fov_deg < 90, "association.fov_deg", self.fov_deg, "between 0 and 90")
+
+
+@dataclass(frozen=True, slots=True)
+class FusionSettings:
+    """Accumulation over travel.
+
+    Args:
+        travel_m: path length of a window (paper: about 3).
+        max_time_s: longest window.
+        capacity: points the ring buffer holds; the oldest are overwritten and counted.
+        max_pose_gap_s: poses further apart are not interpolated; frames inside are counted as lost.
+        min_frames: fewer frames in a window mark it as incomplete.
+    """
+
+    travel_m: float = 3.0
+    max_time_s: float = 6.5
+    capacity: int = 32768
+    max_pose_gap_s: float = 0.1
+    min_frames: int = 60
+
+    def __post_init__(self) -> None:
+        require(self.travel_m > 0, "fusion.travel_m", self.travel_m, "> 0")
+        require(self.max_time_s > 0, "fusion.max_time_s", self.max_time_s, "> 0")
+        require(self.capacity >= 1024, "fusion.capacity", self.capacity, ">= 1024")
+        require(self.max_pose_gap_s > 0, "fusion.max_pose_gap_s", self.max_pose_gap_s, "> 0")
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSettings:
+    """Clustering of a fused cloud and identities.
+
+    Args:
+        neighbour_m: points closer than this on the ground plane are of one object.
+        core_points: a point with at least this many neighbours (itself included) grows its object.
+        min_points: smaller clusters are clutter.
+        ground_clearance_m: points lower than this above ground take no part in clustering and join the nearest object after.
+        max_extent_m: longer clusters are not road users and are dropped (and counted).
+        match_m: an object this close to one of the window before keeps its identity.
+        forget_s: an identity unseen for longer is retired.
+    """
+
+    neighbour_m: float = 0.6
+    core_points: int = 4
+    min_points: int = 24
+    ground_clearance_m: float = 0.15
+    max_extent_m: float = 8.0
+    match_m: float = 1.5
+    forget_s: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class CompletionSettings:
+    """The network at run time.
+
+    Args:
+        model: name of a folder in models/, or a path to one.
+        min_points: fewer input points give no shape.
+        max_points: more are thinned at random (seeded), never padded.
+        intra_op_threads: ONNX Runtime threads.
+        min_confidence: below it the class is published as "unknown".
+    """
+
+    model: str = "default"
+    min_points: int = 64
+    max_points: int = 2048
+    intra_op_threads: int = 1
+    min_confidence: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """Where results are published.
+
+    Args:
+        endpoints: ZeroMQ addresses to bind; only ipc:// and loopback are accepted.
+        send_high_water_mark: messages queued per subscriber before the newest are dropped for it.
+    """
+
+    endpoints: tuple[str, ...] = ("tcp://127.0.0.1:5600",)
+    send_high_water_mark: int = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PipelineSettings:
+    """All processing groups together."""
+
+    heatmap: HeatmapSettings = field(default_factory=HeatmapSettings)
+    cfar: CfarSettings = field(default_factory=CfarSettings)
+    antenna: AntennaSettings = field(default_factory=AntennaSettings)
+    association: AssociationSettings = field(default_factory=AssociationSettings)
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    objects: ObjectSettings = field(default_factory=ObjectSettings)
+    completion: CompletionSettings = field(default_factory=CompletionSettings)
+    stream: StreamSettings = field(default_factory=StreamSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """One board on the rig.
+
+    Args:
+        position_m: phase centre of its array in the rig frame (x, y, z).
+        power_offset_db: added to the board's powers before association.
+        array_sign: +1 when antenna positions grow towards +y (horizontal) or +z (vertical), -1 when the board is turned round.
+        range_offset_m: added to the board's ranges (cables, delays).
+    """
+
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    power_offset_db: float = 0.0
+    array_sign: Literal[1, -1] = 1
+    range_offset_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.array_sign in (1, -1), "mounting.array_sign", self.array_sign, "1 or -1")
+
+
+@dataclass(frozen=True, slots=True)
+class RigGeometry:
+    """How the rig stands on the vehicle.
+
+    Args:
+        height_m: rig origin above the ground.
+        yaw_deg, pitch_deg, roll_deg: rig axes in the vehicle (base_link) frame; yaw 90 looks to the left.
+        offset_m: rig origin in the vehicle frame.
+    """
+
+    height_m: float = 0.8
+    yaw_deg: float = 90.0
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.8)
+
+
+CalibrationPath = Path | None

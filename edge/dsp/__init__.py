@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels and stages from raw samples to detections."""
