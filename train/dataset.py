@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The data set: partial clouds made on the fly from collected and parametric meshes, with the complete surface as truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from edge.config import require
+from edge.frames import Float32
+from train.objects.deform import DeformSettings, vary
+from train.objects.library import PROCEDURAL, SPLITS, Entry, Split, default_objects_dir, read_manifest
+from train.objects.mesh import CLASSES, ClassName, Mesh, MeshError
+from train.objects.parametric import generate
+from train.objects.sampling import sample_surface
+from train.perturb import AZIMUTH_SECTORS, PerturbSettings, perturb
+
+__all__ = ["CLASSES", "CompletionDataset", "DatasetSettings", "Sample", "mean_shape"]
+
+Origin = Literal["collected", "procedural", "parametric"]
+_ORIGINS: tuple[Origin, ...] = ("collected", "procedural", "parametric")
+_EVALUATION_PARAMETRIC = 12
+"""Parametric objects of a class in val and test when the library holds no collected one."""
+_ATTEMPTS = 16
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One pair of input and truth.
+
+    Args:
+        partial: float32 [n, 3], metres, n real points (never padded), ground z = 0, x and y from the centre (mean) of
+            the partial cloud, as in the runtime's object frame; in the box frame x and y from the centre of the truth.
+        truth: float32 [truth_points, 3], same frame, uniform by area, random order.
+        label: index into CLASSES.
+        object_id: "<class>/<name>".
+    """
+
+    partial: Float32
+    truth: Float32
+    label: int
+    object_id: str
+
+
+@dataclass(frozen=True)
+class DatasetSettings:
+    """What is drawn.
+
+    Args:
+        objects_dir: library folder; None = parametric objects only. ``DatasetSettings.default()`` finds the folder.
+        max_points, min_points: points of a partial cloud; a draw with fewer is repeated with a new view point.
+        truth_points: points of the truth.
+        perturbation, deformation: see there; deformation is applied in train only.
+        box_frame: the variant with box priors: x along the object, origin at the centre of the complete shape on the
+            ground; the trainer scales to the unit sphere. Otherwise any yaw and the centre of the input.
+        epoch_samples: samples of one training epoch, classes in turn.
+        evaluation_views: samples of every val and test object, azimuth sectors in turn.
+        origin_share: chance of a collected, a procedural (library) and an own parametric object in train, by class;
+            shares of an origin that has no object go to the others.
+        parametric_objects: how many different parametric objects of a class there are in train.
+    Raises:
+        ConfigError: a number outside its range.
+    """
+
+    objects_dir: Path | None = None
+    max_points: int = 2048
+    min_points: int = 64
+    truth_points: int = 16384
+    perturbation: PerturbSettings = field(default_factory=PerturbSettings)
+    deformation: DeformSettings = field(default_factory=DeformSettings)
+    box_frame: bool = False
+    epoch_samples: int = 20_000
+    evaluation_views: int = 8
+    origin_share: dict[ClassName, tuple[float, float, float]] = field(
+        default_factory=lambda: {
+            "car": (0.75, 0.0, 0.25),
+            "bicycle": (0.45, 0.35, 0.2),
+            "motorcycle": (0.45, 0.35, 0.2),
+            "pedestrian": (0.75, 0.0, 0.25),
+        }
+    )
+    parametric_objects: int = 256
+
+    def __post_init__(self) -> None:
+        require(1 <= self.min_points <= self.max_points, "dataset.min_points", self.min_points, "1..max_points")
+        require(self.truth_points >= 1, "dataset.truth_points", self.truth_points, ">= 1")
+        require(self.epoch_samples >= 1, "dataset.epoch_samples", self.epoch_samples, ">= 1")
+        require(self.evaluation_views >= 1, "dataset.evaluation_views", self.evaluation_views, ">= 1")
+        require(self.parametric_objects >= 1, "dataset.parametric_objects", self.parametric_objects, ">= 1")
+        require(set(self.origin_share) == set(CLASSES), "dataset.origin_share", set(self.origin_share), str(CLASSES))
+
+    @classmethod
+    def default(cls, **changes: object) -> DatasetSettings:
+        """Settings with the project's object library when this machine has one."""
+        return replace(cls(objects_dir=default_objects_dir()), **changes)  # type: ignore[arg-type]
+
+
+class CompletionDataset(torch.utils.data.Dataset[Sample]):
+    """Map-style data set; item ``index`` is a pure function of (split, seed, epoch, index, settings).
+
+    Args:
+        split: "train" (varied objects, new draws every epoch), "val" or "test" (objects as they are, the same draws
+            always, whatever the epoch).
+        settings: what is drawn.
+        seed: of every chance decision.
+    Raises:
+        MeshError: the library is there but cannot be read.
+    """
+
+    def __init__(self, split: Split, settings: DatasetSettings, seed: int) -> None:
+        require(split in SPLITS, "dataset.split", split, ", ".join(SPLITS))
+        self.split: Split = split
+        self.settings = settings
+        self.seed = seed
+        self._perturbation = replace(settings.perturbation, max_points=settings.max_points)
+        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # loader workers that persist see it change
+        self._library: dict[tuple[int, Origin], list[Entry]] = {}
+        for entry in read_manifest(settings.objects_dir) if settings.objects_dir else []:
+            origin: Origin = "procedural" if entry.provenance == PROCEDURAL else "collected"
+            if entry.split == split:
+                self._library.setdefault((entry.label, origin), []).append(entry)
+        self._evaluation = [] if split == "train" else self._evaluation_objects()
+
+    def _evaluation_objects(self) -> list[Entry | tuple[int, int]]:
+        """Collected objects of the split, or (class, seed) of parametric ones where a class has none."""
+        objects: list[Entry | tuple[int, int]] = []
+        for label in range(len(CLASSES)):
+            collected = self._library.get((label, "collected"), [])
+            objects += collected or [(label, number) for number in range(_EVALUATION_PARAMETRIC)]
+        return objects
+
+    def __len__(self) -> int:
+        if self.split == "train":
+            return self.settings.epoch_samples
+        return len(self._evaluation) * self.settings.evaluation_views
+
+    def set_epoch(self, epoch: int) -> None:
+        """New draws for the next pass (train only); also seen by running loader workers."""
+        self._epoch[0] = epoch
+
+    @property
+    def object_ids(self) -> list[str]:
+        """Names of the library's objects that this split draws from."""
+        return [entry.object_id for entries in self._library.values() for entry in entries]
+
+    def mesh(self, index: int) -> Mesh:
+        """The complete object of a sample, before yaw and shift."""
+        return self._mesh(index, self._generator(index))
+
+    def __getitem__(self, index: int) -> Sample:
+        if not 0 <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        rng = self._generator(index)
+        mesh = self._mesh(index, rng)
+        settings = self.settings
+        sector = index // len(CLASSES) if self.split == "train" else index % settings.evaluation_views
+        for _ in range(_ATTEMPTS):
+            partial = perturb(mesh, self._perturbation, rng, sector % AZIMUTH_SECTORS)
+            if len(partial) >= settings.min_points:
+                break
+        else:
+            raise MeshError(
+                f"{mesh.object_id}: no view gives enough points",
+                value=len(partial),
+                allowed=f">= {settings.min_points}",
+                action="lower dataset.min_points or the perturbation",
+            )
+        truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
+        if not settings.box_frame:
+            yaw = rng.uniform(0, 2 * math.pi)
+            c, s = math.cos(yaw), math.sin(yaw)
+            rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
+            partial, truth = partial @ rotation, truth @ rotation
+            center = np.append(partial[:, :2].mean(axis=0), 0).astype(np.float32)
+            partial, truth = partial - center, truth - center
+        return Sample(np.ascontiguousarray(partial), np.ascontiguousarray(truth), mesh.label, mesh.object_id)
+
+    def _generator(self, index: int) -> np.random.Generator:
+        epoch = int(self._epoch[0]) if self.split == "train" else 0
+        return np.random.default_rng([self.seed, SPLITS.index(self.split), epoch, index])
+
+    def _mesh(self, index: int, rng: np.random.Generator) -> Mesh:
+        if self.split != "train":
+            item = self._evaluation[index // self.settings.evaluation_views]
+            return _load(item) if isinstance(item, Entry) else _parametric(*item, self.split)
+        label = index % len(CLASSES)
+        share = np.array(self.settings.origin_share[CLASSES[label]], dtype=float)
+        for number, origin in enumerate(_ORIGINS[:2]):
+            share[number] *= bool(self._library.get((label, origin)))
+        if share.sum() == 0:
+            share[2] = 1
+        origin = _ORIGINS[rng.choice(3, p=share / share.sum())]
+        if origin == "parametric":
+            mesh = _parametric(label, int(rng.integers(self.settings.parametric_objects)), self.split)
+        else:
+            entries = self._library[label, origin]
+            mesh = _load(entries[rng.integers(len(entries))])
+        return vary(mesh, self.settings.deformation, rng)
+
+
+@lru_cache(maxsize=None)
+def _load(entry: Entry) -> Mesh:
+    """A library mesh, kept in memory (the whole library is about 50 MB)."""
+    return entry.load()
+
+
+@lru_cache(maxsize=2048)
+def _parametric(label: int, number: int, split: Split) -> Mesh:
+    """A parametric mesh, kept in memory; the splits have seeds of their own."""
+    return generate(CLASSES[label], 3 * number + SPLITS.index(split))
+
+
+def mean_shape(dataset: CompletionDataset, points: int) -> Float32:
+    """A cloud drawn from the mean distribution of the data: every point from the truth of another random sample.
+
+    Args:
+        dataset: where the samples come from.
+        points: size of the result.
+    Returns:
+        float32 [points, 3], in the samples' frame.
+    """
+    draws = min(256, len(dataset), points)
+    rng = np.random.default_rng([dataset.seed, points])
+    chosen = rng.choice(len(dataset), draws, replace=False)
+    counts = np.full(draws, points // draws)
+    counts[: points % draws] += 1
+    parts = [dataset[int(i)].truth[:n] for i, n in zip(chosen, counts, strict=True)]
+    shape = np.concatenate(parts)
+    return shape[rng.permutation(len(shape))]

@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a mesh to a cloud as a fused radar cloud would be: view points, depth map, specular spots and holes, noise spheres.
+
+The paper's augmentation (section 4.3, second part) is camera, depth snapshot, noise spheres, then holes. Everything
+marked "ours" below is an addition and has its own switch; ``PerturbSettings.paper()`` turns all of them off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edge.config import require
+from edge.frames import Float32, Float64
+from train.depth_scan import Hits, scan
+from train.objects.mesh import Mesh
+
+Range = tuple[float, float]
+AZIMUTH_SECTORS = 8
+_CANDIDATES = 8000
+
+
+@dataclass(frozen=True, slots=True)
+class PerturbSettings:
+    """Settings of every step; a pair is the range of a uniform draw, a probability is that the step happens at all.
+
+    Args:
+        distance_m: camera to the nearer end of the object, log-uniform; half the object's length is added.
+        height_m: camera above ground. aim_deg: largest error of the aim, in azimuth and elevation.
+        columns, rows: size of the depth map, fitted to the object.
+        path_probability, path_views, path_m: several snapshots merged along a straight path past the object (ours).
+        base_points: points drawn from the snapshot.
+        specular_probability: draw them in dense clusters about points that face the radar (ours, measured on clouds of
+            the real pipeline: 16..53 % of the visible surface has a point within 15 cm). specular_spots: number of
+            clusters; specular_radius_m: their sigma; specular_background: share of the weight that is not clustered.
+        pass_probability, pass_share: only this share of the object's width was passed (ours).
+        holes, hole_count, hole_radius_share: spheres cut out; radius as a share of the object's 3-D diagonal.
+        hole_min_keep: a hole that would leave less than this share of the points is skipped.
+        noise, noise_copies, noise_radius_m: each point becomes several on a sphere about it of radius R0 U(0, 1).
+        noise_by_distance: R0 = (0.02 R + 0.03 m) U(0.5, 1.5), kept inside noise_radius_m (ours); else R0 is uniform.
+        ellipsoid_probability: the sphere becomes an ellipsoid of half a range bin (3 cm) along the ray (ours).
+        noise_first: order of the paper; False cuts the holes first, so that their rims get fuzzy (ours).
+        extra_probability: for each of drift, outliers, ghosts and streaks (ours). drift_sigma: metres a metre of path.
+            outlier_share, ghost_share, streak_share: points added, as a share; streak_deg: along the iso-range arc.
+        clip_z_m: points outside are dropped.
+        sparse_probability, sparse_points: thin to a very sparse cloud (ours), log-uniform.
+        thin: thin the other clouds to a log-uniform number between sparse_points[1] and max_points (ours).
+        max_points: never more; fewer are never filled up.
+    """
+
+    distance_m: Range = (3.0, 12.0)
+    height_m: Range = (0.4, 1.2)
+    aim_deg: float = 3.0
+    columns: int = 160
+    rows: int = 120
+    path_probability: float = 0.5
+    path_views: tuple[int, int] = (2, 4)
+    path_m: float = 3.0
+    base_points: tuple[int, int] = (400, 1500)
+    specular_probability: float = 0.5
+    specular_spots: tuple[int, int] = (3, 14)
+    specular_radius_m: Range = (0.05, 0.35)
+    specular_background: Range = (0.0, 0.15)
+    pass_probability: float = 0.2
+    pass_share: Range = (0.4, 0.9)
+    holes: bool = True
+    hole_count: tuple[int, int] = (2, 6)
+    hole_radius_share: Range = (0.08, 0.25)
+    hole_min_keep: float = 0.25
+    noise: bool = True
+    noise_copies: tuple[int, int] = (2, 6)
+    noise_radius_m: Range = (0.05, 0.30)
+    noise_by_distance: bool = True
+    ellipsoid_probability: float = 0.3
+    noise_first: bool = False
+    extra_probability: float = 0.25
+    drift_sigma: float = 0.03
+    outlier_share: float = 0.03
+    ghost_share: float = 0.05
+    streak_share: float = 0.05
+    streak_deg: Range = (2.0, 6.0)
+    clip_z_m: Range = (0.0, 3.0)
+    sparse_probability: float = 0.25
+    sparse_points: tuple[int, int] = (64, 300)
+    thin: bool = True
+    max_points: int = 2048
+
+    def __post_init__(self) -> None:
+        require(0 < self.distance_m[0] <= self.distance_m[1], "perturb.distance_m", self.distance_m, "0 < near <= far")
+        require(self.max_points >= 1, "perturb.max_points", self.max_points, ">= 1")
+        require(self.base_points[0] >= 1, "perturb.base_points", self.base_points, ">= 1")
+        require(self.noise_copies[0] >= 1, "perturb.noise_copies", self.noise_copies, ">= 1")
+        require(0 <= self.hole_min_keep < 1, "perturb.hole_min_keep", self.hole_min_keep, "0..1")
+
+    @classmethod
+    def paper(cls, **changes: object) -> PerturbSettings:
+        """Only what the paper describes, in its order: one snapshot, noise spheres, then holes."""
+        plain = cls(
+            path_probability=0, specular_probability=0, pass_probability=0, noise_by_distance=False,
+            ellipsoid_probability=0, noise_first=True, extra_probability=0, sparse_probability=0, thin=False,
+        )  # fmt: skip
+        return replace(plain, **changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Where the radar passes the object, in the object's frame.
+
+    Args:
+        azimuth_rad: direction from the object to the middle of the path.
+        positions: float64 [views, 3], metres.
+        targets: float64 [views, 3], where the camera looks.
+    """
+
+    azimuth_rad: float
+    positions: Float64
+    targets: Float64
+
+    @property
+    def middle(self) -> Float64:
+        """Middle of the path, float64 [3]."""
+        middle: Float64 = self.positions.mean(axis=0)
+        return middle
+
+    @property
+    def along(self) -> Float64:
+        """Unit vector of the path, float64 [2]."""
+        return np.array([-math.sin(self.azimuth_rad), math.cos(self.azimuth_rad)])
+
+
+def draw_view(mesh: Mesh, settings: PerturbSettings, rng: np.random.Generator, sector: int | None = None) -> View:
+    """Draw a view point as a car at the road side would have it.
+
+    Args:
+        mesh: the object.
+        sector: azimuth inside this eighth of the circle (stratified), None = anywhere.
+    """
+    share = rng.random() if sector is None else (sector % AZIMUTH_SECTORS + rng.random()) / AZIMUTH_SECTORS
+    azimuth = 2 * math.pi * share
+    size = mesh.size_m
+    distance = math.exp(rng.uniform(*np.log(settings.distance_m))) + float(size[0]) / 2
+    views = 1
+    if rng.random() < settings.path_probability:
+        views = int(rng.integers(settings.path_views[0], settings.path_views[1] + 1))
+    offset = np.linspace(-0.5, 0.5, views) * settings.path_m if views > 1 else np.zeros(1)
+    height = rng.uniform(*settings.height_m)
+    c, s = math.cos(azimuth), math.sin(azimuth)
+    positions = np.stack(
+        [distance * c - offset * s, distance * s + offset * c, np.full(views, height)], axis=1
+    )  # on a line at right angles to the direction of the object
+    center = np.array([0.0, 0.0, float(size[2]) / 2])
+    error = distance * np.tan(np.radians(rng.uniform(-settings.aim_deg, settings.aim_deg, (views, 2))))
+    targets = center + np.stack([-s * error[:, 0], c * error[:, 0], error[:, 1]], axis=1)
+    return View(azimuth, positions, targets)
+
+
+def snapshot(mesh: Mesh, view: View, settings: PerturbSettings) -> Hits:
+    """Merged hits of all view points on the path."""
+    hits = [
+        scan(mesh.vertices, mesh.faces, position, target, settings.columns, settings.rows)
+        for position, target in zip(view.positions, view.targets, strict=True)
+    ]
+    return Hits(
+        np.concatenate([h.points for h in hits]),
+        np.concatenate([h.faces for h in hits]),
+        np.concatenate([h.cosine for h in hits]),
+    )
+
+
+def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings, rng: np.random.Generator) -> Float64:
+    """Weight of every hit when a few spots outshine the rest (ours); sums to 1.
+
+    Spots are drawn with probability cos^8 of the incidence plus a floor for corners and edges, each with its own sigma
+    and strength; a fraction of the weight stays spread over everything.
+    """
+    count = int(rng.integers(settings.specular_spots[0], settings.specular_spots[1] + 1))
+    chance = cosine.astype(np.float64) ** 8 + 0.05
+    spots = rng.choice(len(points), size=count, p=chance / chance.sum())
+    sigma = rng.uniform(*settings.specular_radius_m, size=count)
+    strength = rng.exponential(size=count) + 0.1
+    distance2 = ((points[:, None, :] - points[None, spots, :]) ** 2).sum(axis=2)
+    weight = (strength * np.exp(-distance2 / (2 * sigma**2))).sum(axis=1)
+    background = rng.uniform(*settings.specular_background)
+    spread: Float64 = (1 - background) * weight / weight.sum() + background / len(points)
+    return spread
+
+
+def _draw(count: int, weight: Float64, rng: np.random.Generator) -> np.ndarray:
+    """``count`` different rows, probability proportional to weight (exponential keys, Efraimidis and Spirakis 2006)."""
+    if count >= len(weight):
+        return np.arange(len(weight))
+    key = rng.standard_exponential(len(weight)) / np.maximum(weight, 1e-12)
+    return np.argpartition(key, count)[:count]
+
+
+def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
+    """Some hundred points of the snapshot: uniform over its pixels, or clustered, maybe only of a part of the object."""
+    chosen = np.arange(len(hits.points))
+    if len(chosen) > _CANDIDATES:
+        chosen = rng.choice(chosen, _CANDIDATES, replace=False)
+    points, cosine = hits.points[chosen], hits.cosine[chosen]
+    if rng.random() < settings.pass_probability:
+        along = points[:, :2] @ view.along
+        low, high = float(along.min()), float(along.max())
+        width = (high - low) * rng.uniform(*settings.pass_share)
+        start = rng.uniform(low, high - width)
+        inside = (along >= start) & (along <= start + width)
+        points, cosine = points[inside], cosine[inside]
+    count = int(rng.integers(settings.base_points[0], settings.base_points[1] + 1))
+    if len(points) > 0 and rng.random() < settings.specular_probability:
+        weight = specular_weights(points, cosine, settings, rng)
+    else:
+        weight = np.ones(len(points))
+    return points[_draw(count, weight, rng)]
+
+
+def cut_holes(
+    points: Float32, diagonal_m: float, settings: PerturbSettings, rng: np.random.Generator
+) -> tuple[Float32, list[tuple[Float32, float]]]:
+    """Crop several spheres, the first near the centre of the cloud, as specular surfaces reflect away.
+
+    Args:
+        points: float32 [n, 3].
+        diagonal_m: 3-D diagonal of the object.
+    Returns:
+        The points outside all spheres, and the spheres (centre [3], radius in metres) that were cut.
+    """
+    count = int(rng.integers(settings.hole_count[0], settings.hole_count[1] + 1))
+    least = settings.hole_min_keep * len(points)
+    cut: list[tuple[Float32, float]] = []
+    for number in range(count):
+        if len(points) == 0:
+            break
+        if number == 0:
+            distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
+            nearest = np.argsort(distance)[: max(1, int(0.15 * len(points)))]
+            center = points[rng.choice(nearest)]
+        else:
+            center = points[rng.integers(len(points))]
+        radius = float(rng.uniform(*settings.hole_radius_share)) * diagonal_m
+        outside = np.linalg.norm(points - center, axis=1) > radius
+        if np.count_nonzero(outside) >= max(least, 1):
+            points = points[outside]
+            cut.append((center, radius))
+    return points, cut
+
+
+def noise_spheres(points: Float32, position: Float64, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
+    """Replace every point by several on a sphere (or ellipsoid) about it.
+
+    Args:
+        points: float32 [n, 3].
+        position: float64 [3], the radar.
+    Returns:
+        float32 [sum of the copies, 3].
+    """
+    copies = rng.integers(settings.noise_copies[0], settings.noise_copies[1] + 1, size=len(points))
+    center = np.repeat(points, copies, axis=0).astype(np.float64)
+    ray = center - position
+    distance = np.linalg.norm(ray, axis=1, keepdims=True)
+    if settings.noise_by_distance:
+        factor = rng.uniform(0.5, 1.5)
+        largest = np.clip((0.02 * distance + 0.03) * factor, *settings.noise_radius_m)
+    else:
+        largest = np.full((len(center), 1), rng.uniform(*settings.noise_radius_m))
+    radius = largest * np.repeat(rng.random(len(points)), copies)[:, None]
+    direction = rng.normal(size=center.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    if rng.random() < settings.ellipsoid_probability:
+        ray /= np.maximum(distance, 1e-9)
+        radial = (direction * ray).sum(axis=1, keepdims=True)
+        flat = np.minimum(1.0, 0.03 / np.maximum(largest, 1e-9))
+        direction = direction + (flat - 1.0) * radial * ray
+    return (center + radius * direction).astype(np.float32)
+
+
+def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
+    """Odometry drift, outliers, ghosts of the ground and side-lobe streaks, each with its own chance (ours)."""
+    happens = rng.random(4) < settings.extra_probability
+    count = len(points)
+    if happens[0]:
+        slope = rng.normal(0, settings.drift_sigma, 2)
+        points = points.copy()
+        points[:, :2] += (points[:, :2] @ view.along)[:, None] * slope
+    added = [points]
+    if happens[1]:
+        low, high = points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
+        added.append(rng.uniform(low, high, (int(settings.outlier_share * count), 3)))
+    if happens[2]:  # mirrored about a ground that is not quite flat; the part that stays above z = 0 survives the clip
+        ghost = points[rng.integers(count, size=int(settings.ghost_share * count))].copy()
+        ghost[:, 2] = 2 * rng.normal(0, 0.1) - ghost[:, 2]
+        added.append(ghost)
+    if happens[3]:
+        added.append(
+            _streaks(points[rng.integers(count, size=int(settings.streak_share * count))], view, settings, rng)
+        )
+    return np.concatenate(added).astype(np.float32)
+
+
+def _streaks(points: Float32, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float64:
+    """Points moved along their iso-range arc, in azimuth (horizontal radar) or elevation (vertical radar)."""
+    ray = points - view.middle
+    angle = np.radians(rng.uniform(*settings.streak_deg, len(points))) * rng.choice([-1.0, 1.0], len(points))
+    horizontal = rng.random(len(points)) < 0.5
+    azimuth = np.arctan2(ray[:, 1], ray[:, 0]) + np.where(horizontal, angle, 0)
+    ground = np.hypot(ray[:, 0], ray[:, 1])
+    elevation = np.arctan2(ray[:, 2], ground) + np.where(horizontal, 0, angle)
+    distance = np.linalg.norm(ray, axis=1)
+    flat = distance * np.cos(elevation)
+    moved = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+    return moved + view.middle
+
+
+def _final_count(settings: PerturbSettings, rng: np.random.Generator) -> int:
+    """Number of points that are kept at most."""
+    limit = settings.max_points
+    low, high = settings.sparse_points
+    if rng.random() < settings.sparse_probability:
+        return min(limit, round(math.exp(rng.uniform(math.log(low), math.log(high)))))
+    if settings.thin and limit > high:
+        return round(math.exp(rng.uniform(math.log(high), math.log(limit))))
+    return limit
+
+
+def perturb(mesh: Mesh, settings: PerturbSettings, rng: np.random.Generator, sector: int | None = None) -> Float32:
+    """A partial, holed, noisy cloud of an object in the object's own frame.
+
+    Args:
+        mesh: the object, ground z = 0.
+        settings: what is done, and how much.
+        rng: source of chance; the same state gives the same cloud.
+        sector: eighth of the circle the radar stands in, None = anywhere.
+    Returns:
+        float32 [n, 3], n <= max_points, random order, no point repeated; n can be small, even 0, when little is seen.
+    """
+    view = draw_view(mesh, settings, rng, sector)
+    points = base_sample(snapshot(mesh, view, settings), view, settings, rng)
+    diagonal = float(np.linalg.norm(mesh.size_m))
+    if settings.noise and settings.noise_first:
+        points = noise_spheres(points, view.middle, settings, rng)
+    if settings.holes:
+        points, _ = cut_holes(points, diagonal, settings, rng)
+    if settings.noise and not settings.noise_first:
+        points = noise_spheres(points, view.middle, settings, rng)
+    if len(points) > 0:
+        points = add_artefacts(points, view, settings, rng)
+    low, high = settings.clip_z_m
+    points = points[(points[:, 2] > low) & (points[:, 2] < high)]
+    return points[rng.permutation(len(points))[: _final_count(settings, rng)]]
