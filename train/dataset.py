@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The data set: partial clouds made on the fly from collected and parametric meshes, with the complete surface as truth."""
+"""The data set: partial clouds made on the fly from collected and parametric meshes, the complete surface as truth."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -119,7 +119,8 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         self.settings = settings
         self.seed = seed
         self._perturbation = replace(settings.perturbation, max_points=settings.max_points)
-        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # loader workers that persist see it change
+        self._epoch = torch.zeros(1, dtype=torch.int64)
+        self._epoch.share_memory_()  # type: ignore[no-untyped-call]  # loader workers that persist see it change
         self._library: dict[tuple[int, Origin], list[Entry]] = {}
         for entry in read_manifest(settings.objects_dir) if settings.objects_dir else []:
             origin: Origin = "procedural" if entry.provenance == PROCEDURAL else "collected"
@@ -204,7 +205,7 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         return vary(mesh, self.settings.deformation, rng)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _load(entry: Entry) -> Mesh:
     """A library mesh, kept in memory (the whole library is about 50 MB)."""
     return entry.load()

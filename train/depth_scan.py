@@ -76,12 +76,62 @@ def rasterize(
 
 
 def look_at(position: Float64, target: Float64) -> Float64:
-    """Rotation from the world to a camera at ``position`` that looks at ``target``: rows right, down, forward [3, 3]."""
+    """Rotation from the world to a camera at ``position`` that looks at ``target``; rows right, down, forward."""
     forward = target - position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
     return np.stack([right, np.cross(forward, right), forward])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _to_camera(vertices: Float32, position: Float64, rotation: Float64, out: Float32) -> Float64:  # pragma: no cover
+    """Vertices in the camera frame into ``out`` [n, 3]; lowest and highest slopes x / z, y / z of those ahead [4]."""
+    low_u, low_v, high_u, high_v = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(len(vertices)):
+        x, y, z = vertices[i, 0] - position[0], vertices[i, 1] - position[1], vertices[i, 2] - position[2]
+        for k in range(3):
+            out[i, k] = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z
+        if out[i, 2] > 1e-3:
+            u, v = out[i, 0] / out[i, 2], out[i, 1] / out[i, 2]
+            low_u, high_u = min(low_u, u), max(high_u, u)
+            low_v, high_v = min(low_v, v), max(high_v, v)
+    return np.array([low_u, low_v, high_u, high_v])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _collect(
+    depth: Float32,
+    hit: Int32,
+    camera: Float32,
+    faces: Int32,
+    focal: float,
+    center_u: float,
+    center_v: float,
+    points: Float32,
+    seen: Int32,
+    cosine: Float32,
+) -> int:  # pragma: no cover - compiled
+    """Pixels that see something: camera-frame points, their faces and incidence; returns how many."""
+    count = 0
+    rows, columns = depth.shape
+    for v in range(rows):
+        for u in range(columns):
+            f = hit[v, u]
+            if f < 0:
+                continue
+            z = depth[v, u]
+            x, y = (u - center_u) / focal * z, (v - center_v) / focal * z
+            points[count, 0], points[count, 1], points[count, 2] = x, y, z
+            seen[count] = f
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            ax, ay, az = camera[b, 0] - camera[a, 0], camera[b, 1] - camera[a, 1], camera[b, 2] - camera[a, 2]
+            bx, by, bz = camera[c, 0] - camera[a, 0], camera[c, 1] - camera[a, 1], camera[c, 2] - camera[a, 2]
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            length = np.sqrt((nx * nx + ny * ny + nz * nz) * (x * x + y * y + z * z))
+            cosine[count] = abs(nx * x + ny * y + nz * z) / length if length > 0 else 0.0
+            count += 1
+    return count
 
 
 def project(
@@ -98,16 +148,13 @@ def project(
         and middle row of the pinhole in pixels.
     """
     rotation = look_at(position, target)
-    camera = ((vertices - position.astype(np.float32)) @ rotation.T.astype(np.float32)).astype(np.float32)
-    ahead = camera[camera[:, 2] > 1e-3]
-    if len(ahead) == 0:
+    camera = np.empty_like(vertices)
+    low_u, low_v, high_u, high_v = _to_camera(vertices, position, rotation, camera)
+    if low_u > high_u:
         return camera, rotation, (1.0, 0.0, 0.0)
-    slope = ahead[:, :2] / ahead[:, 2:]
-    low, high = slope.min(axis=0), slope.max(axis=0)
-    extent = np.maximum(high - low, 1e-6)
-    focal = float(min((columns - 1) / extent[0], (rows - 1) / extent[1]))
-    center_u = (columns - 1) / 2 - focal * float(low[0] + high[0]) / 2
-    center_v = (rows - 1) / 2 - focal * float(low[1] + high[1]) / 2
+    focal = float(min((columns - 1) / max(high_u - low_u, 1e-6), (rows - 1) / max(high_v - low_v, 1e-6)))
+    center_u = (columns - 1) / 2 - focal * (low_u + high_u) / 2
+    center_v = (rows - 1) / 2 - focal * (low_v + high_v) / 2
     return camera, rotation, (focal, center_u, center_v)
 
 
@@ -124,22 +171,13 @@ def scan(
     Returns:
         One hit for every pixel that sees the object, in the order of the pixels.
     """
-    camera, rotation, (focal, center_u, center_v) = project(vertices, position, target, columns, rows)
+    camera, rotation, pinhole = project(vertices, position, target, columns, rows)
     depth = np.empty((rows, columns), np.float32)
     hit = np.empty((rows, columns), np.int32)
-    rasterize(camera, faces, focal, center_u, center_v, depth, hit)
-    v, u = np.nonzero(hit != NOTHING)
-    ray = np.stack([(u - center_u) / focal, (v - center_v) / focal, np.ones(len(u))], axis=1)
-    points = (ray * depth[v, u][:, None]) @ rotation + position
-    seen = hit[v, u]
-    return Hits(points.astype(np.float32), seen, _incidence(vertices, faces[seen], points, position))
-
-
-def _incidence(vertices: Float32, corners: Int32, points: Float64, position: Float64) -> Float32:
-    """|cos| between the line of sight to every point and the normal of its face; float32 [n]."""
-    a = vertices[corners[:, 0]]
-    normal = np.cross(vertices[corners[:, 1]] - a, vertices[corners[:, 2]] - a)
-    sight = (points - position).astype(np.float32)
-    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(sight, axis=1)
-    cosine = np.abs(np.einsum("ij,ij->i", normal, sight)) / np.maximum(length, 1e-20)
-    return cosine.astype(np.float32)
+    rasterize(camera, faces, *pinhole, depth, hit)
+    points = np.empty((rows * columns, 3), np.float32)
+    seen = np.empty(rows * columns, np.int32)
+    cosine = np.empty(rows * columns, np.float32)
+    count = _collect(depth, hit, camera, faces, *pinhole, points, seen, cosine)
+    world = points[:count] @ rotation.astype(np.float32) + position.astype(np.float32)
+    return Hits(world, seen[:count], cosine[:count])

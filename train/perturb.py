@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a mesh to a cloud as a fused radar cloud would be: view points, depth map, specular spots and holes, noise spheres.
+"""From a mesh to a cloud like a fused radar cloud: view points, depth map, specular spots, holes, noise spheres.
 
 The paper's augmentation (section 4.3, second part) is camera, depth snapshot, noise spheres, then holes. Everything
 marked "ours" below is an addition and has its own switch; ``PerturbSettings.paper()`` turns all of them off.
@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.config import require
 from edge.frames import Float32, Float64
@@ -180,14 +181,16 @@ def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings
     spots = rng.choice(len(points), size=count, p=chance / chance.sum())
     sigma = rng.uniform(*settings.specular_radius_m, size=count)
     strength = rng.exponential(size=count) + 0.1
-    distance2 = ((points[:, None, :] - points[None, spots, :]) ** 2).sum(axis=2)
-    weight = (strength * np.exp(-distance2 / (2 * sigma**2))).sum(axis=1)
+    weight = np.zeros(len(points))
+    for spot, one_sigma, one_strength in zip(spots, sigma, strength, strict=True):
+        away = points - points[spot]
+        weight += one_strength * np.exp(np.einsum("ij,ij->i", away, away) / (-2 * one_sigma**2))
     background = rng.uniform(*settings.specular_background)
     spread: Float64 = (1 - background) * weight / weight.sum() + background / len(points)
     return spread
 
 
-def _draw(count: int, weight: Float64, rng: np.random.Generator) -> np.ndarray:
+def _draw(count: int, weight: Float64, rng: np.random.Generator) -> NDArray[np.int64]:
     """``count`` different rows, probability proportional to weight (exponential keys, Efraimidis and Spirakis 2006)."""
     if count >= len(weight):
         return np.arange(len(weight))
@@ -196,7 +199,7 @@ def _draw(count: int, weight: Float64, rng: np.random.Generator) -> np.ndarray:
 
 
 def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
-    """Some hundred points of the snapshot: uniform over its pixels, or clustered, maybe only of a part of the object."""
+    """Some hundred points of the snapshot: uniform over its pixels or clustered, maybe of a part of the object only."""
     chosen = np.arange(len(hits.points))
     if len(chosen) > _CANDIDATES:
         chosen = rng.choice(chosen, _CANDIDATES, replace=False)
@@ -214,6 +217,12 @@ def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.rando
     else:
         weight = np.ones(len(points))
     return points[_draw(count, weight, rng)]
+
+
+def _norm(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Length of every row."""
+    length: NDArray[np.floating] = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    return length
 
 
 def cut_holes(
@@ -234,13 +243,13 @@ def cut_holes(
         if len(points) == 0:
             break
         if number == 0:
-            distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
+            distance = _norm(points - points.mean(axis=0))
             nearest = np.argsort(distance)[: max(1, int(0.15 * len(points)))]
             center = points[rng.choice(nearest)]
         else:
             center = points[rng.integers(len(points))]
         radius = float(rng.uniform(*settings.hole_radius_share)) * diagonal_m
-        outside = np.linalg.norm(points - center, axis=1) > radius
+        outside = _norm(points - center) > radius
         if np.count_nonzero(outside) >= max(least, 1):
             points = points[outside]
             cut.append((center, radius))
@@ -259,7 +268,7 @@ def noise_spheres(points: Float32, position: Float64, settings: PerturbSettings,
     copies = rng.integers(settings.noise_copies[0], settings.noise_copies[1] + 1, size=len(points))
     center = np.repeat(points, copies, axis=0).astype(np.float64)
     ray = center - position
-    distance = np.linalg.norm(ray, axis=1, keepdims=True)
+    distance = _norm(ray)[:, None]
     if settings.noise_by_distance:
         factor = rng.uniform(0.5, 1.5)
         largest = np.clip((0.02 * distance + 0.03) * factor, *settings.noise_radius_m)
@@ -267,13 +276,14 @@ def noise_spheres(points: Float32, position: Float64, settings: PerturbSettings,
         largest = np.full((len(center), 1), rng.uniform(*settings.noise_radius_m))
     radius = largest * np.repeat(rng.random(len(points)), copies)[:, None]
     direction = rng.normal(size=center.shape)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction /= _norm(direction)[:, None]
     if rng.random() < settings.ellipsoid_probability:
         ray /= np.maximum(distance, 1e-9)
         radial = (direction * ray).sum(axis=1, keepdims=True)
         flat = np.minimum(1.0, 0.03 / np.maximum(largest, 1e-9))
         direction = direction + (flat - 1.0) * radial * ray
-    return (center + radius * direction).astype(np.float32)
+    noisy: Float32 = (center + radius * direction).astype(np.float32)
+    return noisy
 
 
 def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
@@ -284,7 +294,7 @@ def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: n
         slope = rng.normal(0, settings.drift_sigma, 2)
         points = points.copy()
         points[:, :2] += (points[:, :2] @ view.along)[:, None] * slope
-    added = [points]
+    added: list[NDArray[np.floating]] = [points]
     if happens[1]:
         low, high = points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
         added.append(rng.uniform(low, high, (int(settings.outlier_share * count), 3)))
@@ -307,10 +317,11 @@ def _streaks(points: Float32, view: View, settings: PerturbSettings, rng: np.ran
     azimuth = np.arctan2(ray[:, 1], ray[:, 0]) + np.where(horizontal, angle, 0)
     ground = np.hypot(ray[:, 0], ray[:, 1])
     elevation = np.arctan2(ray[:, 2], ground) + np.where(horizontal, 0, angle)
-    distance = np.linalg.norm(ray, axis=1)
+    distance = _norm(ray)
     flat = distance * np.cos(elevation)
     moved = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
-    return moved + view.middle
+    streaks: Float64 = moved + view.middle
+    return streaks
 
 
 def _final_count(settings: PerturbSettings, rng: np.random.Generator) -> int:

@@ -11,6 +11,7 @@ from numba import njit
 
 from edge.frames import Float32, Float64
 from train.objects.mesh import CLASSES, Mesh
+from train.objects.sampling import bounds
 
 LATTICE = (4, 3, 3)
 """Control points along x, y and z (Sederberg and Parry, Free-form deformation of solid geometric models, 1986)."""
@@ -69,11 +70,11 @@ def free_form(vertices: Float32, sigma: tuple[float, float, float], rng: np.rand
     Returns:
         float32 [n, 3].
     """
-    low = vertices.min(axis=0).astype(np.float64)
-    size = np.maximum(np.ptp(vertices, axis=0).astype(np.float64), 1e-6)
+    low, high = bounds(vertices)
+    size = np.maximum(high - low, 1e-6).astype(np.float64)
     offset = rng.normal(size=(*LATTICE, 3)) * np.asarray(sigma) * size
     mirrored = offset[:, ::-1] * np.array([1.0, -1.0, 1.0])
-    return _apply_lattice(vertices, low, size, (offset + mirrored) / math.sqrt(2))
+    return _apply_lattice(vertices, low.astype(np.float64), size, (offset + mirrored) / math.sqrt(2))
 
 
 def lean(vertices: Float32, angle_rad: float) -> Float32:

@@ -22,7 +22,7 @@ PROCEDURAL = "P"
 _SPLIT_KEY = "split-26168"
 """Hashed together with the group's name; chosen once so that every class has collected objects in every split."""
 _TEST_SHARE, _VAL_SHARE = 0.20, 0.15
-_PERSON_BLOCKS = ((0, 96, "train"), (96, 108, "val"), (108, 120, "test"))
+_PERSON_BLOCKS: tuple[tuple[int, int, Split], ...] = ((0, 96, "train"), (96, 108, "val"), (108, 120, "test"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def person_split(seed: int) -> Split:
     """Split of a generated person by its seed: 0..95 train, 96..107 val, 108..119 test, later ones train."""
     for first, end, split in _PERSON_BLOCKS:
         if first <= seed < end:
-            return split  # type: ignore[return-value]
+            return split
     return "train"
 
 

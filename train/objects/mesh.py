@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.errors import RfconstructError
 from edge.frames import Float32
-from train.objects.sampling import Int32
+from train.objects.sampling import Int32, bounds
 
 ClassName = Literal["car", "bicycle", "motorcycle", "pedestrian"]
 CLASSES: tuple[ClassName, ...] = ("car", "bicycle", "motorcycle", "pedestrian")
@@ -60,8 +60,8 @@ class Mesh:
     @property
     def size_m(self) -> Float32:
         """Extent along x, y and z, float32 [3]."""
-        size: Float32 = np.ptp(self.vertices, axis=0)
-        return size
+        low, high = bounds(self.vertices)
+        return high - low
 
     def moved(self, vertices: Float32) -> Mesh:
         """Same object with other vertices (deformed, leaned), stood on the ground again."""
@@ -70,6 +70,6 @@ class Mesh:
 
 def stand(vertices: Float32) -> Float32:
     """Shift so that the lowest point has z = 0 and the bounding box is centred in x and y; float32 [n, 3]."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    shift = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-    return np.ascontiguousarray(vertices - shift, dtype=np.float32)
+    vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+    low, high = bounds(vertices)
+    return vertices - np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]], np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.frames import Float64
 from train.objects.parametric_person import random_body, rider
-from train.objects.primitives import Part, box, curve, lathe, mirrored, superellipsoid, torus, tube
+from train.objects.primitives import Part, box, curve, lathe, mirrored, superellipsoid, torus, tube, vec
 
 RIDER_PROBABILITY = 0.3
 _KINDS = ("city", "road", "mountain", "stepthrough", "kids", "folding")
@@ -76,7 +76,7 @@ def _wheel(center: Float64, radius: float, tyre: float) -> list[Part]:
         angle = 2 * math.pi * number / 18
         side = 0.03 if number % 2 else -0.03
         out = np.array([math.cos(angle), 0, math.sin(angle)])
-        parts.append(tube([center + 0.02 * out + [0, side, 0], center + (rim - 0.01) * out], 0.0015, 3))
+        parts.append(tube([center + 0.02 * out + vec(0, side, 0), center + (rim - 0.01) * out], 0.0015, 3))
     return parts
 
 
@@ -86,34 +86,39 @@ def _bars(kind: str, stem: Float64, rng: np.random.Generator) -> tuple[list[Part
     reach = np.array([0.07 if kind == "road" else 0.05, 0, 0.02])
     if kind == "road":
         side = curve(
-            [stem + reach, stem + reach + [0, half, 0], stem + reach + [0.09, half, -0.01],
-             stem + reach + [0.10, half, -0.08], stem + reach + [0.0, half, -0.13]], 14
+            [stem + reach, stem + reach + vec(0, half, 0), stem + reach + vec(0.09, half, -0.01),
+             stem + reach + vec(0.10, half, -0.08), stem + reach + vec(0.0, half, -0.13)], 14
         )  # fmt: skip
-        grip = stem + reach + [0.09, half, 0.01]
+        grip = stem + reach + vec(0.09, half, 0.01)
     else:
         back = 0.03 if kind == "mountain" else rng.uniform(0.08, 0.22)
         side = curve(
-            [stem + reach, stem + reach + [0.02, 0.35 * half, 0.03], stem + reach + [-0.3 * back, 0.75 * half, 0.04],
-             stem + reach + [-back, half, 0.03]], 12
-        )  # fmt: skip
+            [
+                stem + reach,
+                stem + reach + vec(0.02, 0.35 * half, 0.03),
+                stem + reach + vec(-0.3 * back, 0.75 * half, 0.04),
+                stem + reach + vec(-back, half, 0.03),
+            ],
+            12,
+        )
         grip = side[-2]
     part = tube(side, 0.014, 7)
-    parts = [part, mirrored(part), tube([stem - [0.0, 0, 0.03], stem + reach], 0.015, 6)]
+    parts = [part, mirrored(part), tube([stem - vec(0.0, 0, 0.03), stem + reach], 0.015, 6)]
     return parts, np.stack([grip, grip * np.array([1, -1, 1])])
 
 
 def _cranks(frame: BicycleFrame, angle: float) -> tuple[list[Part], Float64]:
     """Chain ring, both cranks and pedals; returns the ankles above the pedals [2, 3] too."""
     bottom = frame.bottom
-    ring = lathe(bottom + [0, -0.045, 0], [(0.02, 0), (0.09, 0.004), (0.09, -0.004), (0.02, -0.004)], 20)
+    ring = lathe(bottom + vec(0, -0.045, 0), [(0.02, 0), (0.09, 0.004), (0.09, -0.004), (0.02, -0.004)], 20)
     parts, ankles = [ring], []
     for sign in (1.0, -1.0):
         out = 0.17 * sign * np.array([math.cos(angle), 0, math.sin(angle)])
-        start = bottom + [0, 0.055 * sign, 0]
-        end = start + out + [0, 0.02 * sign, 0]
+        start = bottom + vec(0, 0.055 * sign, 0)
+        end = start + out + vec(0, 0.02 * sign, 0)
         parts.append(tube([start, end], 0.012, 6))
-        parts.append(box(end + [0, 0.055 * sign, 0], (0.09, 0.09, 0.025)))
-        ankles.append(end + [-0.09, 0.05 * sign, 0.10])
+        parts.append(box(end + vec(0, 0.055 * sign, 0), (0.09, 0.09, 0.025)))
+        ankles.append(end + vec(-0.09, 0.05 * sign, 0.10))
     return parts, np.stack(ankles)
 
 
@@ -122,22 +127,26 @@ def _tubes(kind: str, frame: BicycleFrame, rng: np.random.Generator) -> list[Par
     thick = rng.uniform(0.014, 0.024)
     lower = frame.head_low + 0.25 * (frame.head_top - frame.head_low)
     upper = frame.head_top - 0.2 * (frame.head_top - frame.head_low)
-    parts = [tube([frame.head_low, frame.head_top], 0.02, 8), tube([frame.bottom, frame.saddle], [0.017, 0.014], 8)]
+    parts = [
+        tube([frame.head_low, frame.head_top], 0.02, 8),
+        tube([frame.head_top, frame.stem], 0.014, 8),
+        tube([frame.bottom, frame.saddle], [0.017, 0.014], 8),
+    ]
     if kind in ("stepthrough", "folding"):
         seat_low = frame.bottom + 0.35 * (frame.seat - frame.bottom)
-        bend = (lower + frame.bottom) / 2 - [0.0, 0, 0.06]
+        bend = (lower + frame.bottom) / 2 - vec(0.0, 0, 0.06)
         parts.append(tube(curve([lower, bend, frame.bottom], 8), 1.3 * thick, 8))
         if kind == "stepthrough":
-            parts.append(tube(curve([upper, bend + [0.02, 0, 0.13], seat_low], 8), thick, 8))
+            parts.append(tube(curve([upper, bend + vec(0.02, 0, 0.13), seat_low], 8), thick, 8))
     else:
         top = frame.seat - (0.05 if kind != "mountain" else rng.uniform(0.05, 0.15)) * np.array([-0.3, 0, 0.95])
         parts += [tube([lower, frame.bottom], 1.15 * thick, 8), tube([upper, top], thick, 8)]
     for sign in (1.0, -1.0):
-        drop = frame.rear + [0, 0.065 * sign, 0]
-        parts.append(tube([frame.bottom + [0, 0.03 * sign, 0], drop], 0.009, 6))
-        parts.append(tube([frame.seat + [0, 0.02 * sign, -0.03], drop], 0.008, 6))
-        crown = frame.head_low + [0, 0.05 * sign, -0.01]
-        parts.append(tube([frame.head_low, crown, frame.front + [0, 0.05 * sign, 0]], [0.014, 0.014, 0.009], 6))
+        drop = frame.rear + vec(0, 0.065 * sign, 0)
+        parts.append(tube([frame.bottom + vec(0, 0.03 * sign, 0), drop], 0.009, 6))
+        parts.append(tube([frame.seat + vec(0, 0.02 * sign, -0.03), drop], 0.008, 6))
+        crown = frame.head_low + vec(0, 0.05 * sign, -0.01)
+        parts.append(tube([frame.head_low, crown, frame.front + vec(0, 0.05 * sign, 0)], [0.014, 0.014, 0.009], 6))
     return parts
 
 
@@ -149,19 +158,19 @@ def _extras(kind: str, frame: BicycleFrame, wheel: float, rng: np.random.Generat
         for center, first, last in ((frame.rear, 15, 175), (frame.front, 40, 170)):
             angle = np.radians(np.linspace(first, last, 14))
             arc = center + (wheel + 0.02) * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-            edges = np.stack([arc + [0, 0.027, -0.006], arc, arc - [0, 0.027, 0.006]], axis=1)
+            edges = np.stack([arc + vec(0, 0.027, -0.006), arc, arc - vec(0, 0.027, 0.006)], axis=1)
             index = np.arange(13)[:, None] * 3 + np.arange(2)
             a = index.ravel()
             parts.append((edges.reshape(-1, 3), np.concatenate([np.stack([a, a + 1, a + 3], 1),
                                                                np.stack([a + 1, a + 4, a + 3], 1)])))  # fmt: skip
     if city and rng.random() < 0.6:
-        rack = frame.rear + [-0.05, 0, wheel + 0.06]
+        rack = frame.rear + vec(-0.05, 0, wheel + 0.06)
         parts.append(box(rack, (0.36, 0.12, 0.015)))
-        parts += [tube([rack + [0.05, 0.06 * s, 0], frame.rear + [0, 0.06 * s, 0]], 0.006, 5) for s in (1, -1)]
+        parts += [tube([rack + vec(0.05, 0.06 * s, 0), frame.rear + vec(0, 0.06 * s, 0)], 0.006, 5) for s in (1, -1)]
         if rng.random() < 0.3:
-            parts.append(box(rack + [0, rng.choice([-1, 1]) * 0.13, -0.15], (0.32, 0.13, 0.3)))
+            parts.append(box(rack + vec(0, rng.choice([-1, 1]) * 0.13, -0.15), (0.32, 0.13, 0.3)))
     if city and rng.random() < 0.25:
-        parts.append(superellipsoid(frame.stem + [0.22, 0, -0.02], (0.15, 0.18, 0.13), (0.3, 0.3), steps=(12, 7)))
+        parts.append(superellipsoid(frame.stem + vec(0.22, 0, -0.02), (0.15, 0.18, 0.13), (0.3, 0.3), steps=(12, 7)))
     return parts
 
 
@@ -180,8 +189,8 @@ def bicycle(rng: np.random.Generator) -> list[Part]:
     grips = (grips - frame.head_low) @ turn.T + frame.head_low
     cranks, ankles = _cranks(frame, rng.uniform(0, 2 * math.pi))
     saddle = [
-        superellipsoid(frame.saddle - [0.04, 0, 0], (0.10, 0.075, 0.03), (0.8, 0.9), steps=(12, 7)),
-        superellipsoid(frame.saddle + [0.07, 0, 0], (0.10, 0.025, 0.025), (0.8, 0.9), steps=(10, 7)),
+        superellipsoid(frame.saddle - vec(0.04, 0, 0), (0.10, 0.075, 0.03), (0.8, 0.9), steps=(12, 7)),
+        superellipsoid(frame.saddle + vec(0.07, 0, 0), (0.10, 0.025, 0.025), (0.8, 0.9), steps=(10, 7)),
     ]
     parts = _wheel(frame.rear, wheel, tyre) + turned + _tubes(kind, frame, rng) + cranks + saddle
     parts += _extras(kind, frame, wheel, rng)
@@ -195,4 +204,5 @@ def _about(axis: Float64, angle_rad: float) -> Float64:
     """Rotation about a unit vector (Rodrigues), float64 [3, 3]."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle_rad) * cross + (1 - math.cos(angle_rad)) * cross @ cross
+    turn: Float64 = np.eye(3) + math.sin(angle_rad) * cross + (1 - math.cos(angle_rad)) * cross @ cross
+    return turn

@@ -29,6 +29,8 @@ _RANGES: dict[Style, tuple[tuple[float, float], tuple[float, float], tuple[float
     "minivan": ((4.4, 5.1), (1.78, 2.0), (1.62, 1.85)),
 }
 """Length, width (without mirrors) and height of every style, metres."""
+_WELL_DEPTH = 0.26
+"""How far the wheel wells reach in from the side, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,11 @@ class CarShape:
     def axles(self) -> tuple[float, float]:
         """Distance of both axles from the front."""
         return self.front_overhang, self.front_overhang + self.wheelbase
+
+    @property
+    def arch_radius(self) -> float:
+        """Radius of the wheel arches."""
+        return self.wheel_radius + 0.06
 
 
 def draw_shape(rng: np.random.Generator, style: Style | None = None) -> CarShape:
@@ -120,10 +127,17 @@ def top_profile(shape: CarShape) -> Float64:
     roof_end = deck_start - (0.95 * h - deck_height) / math.tan(shape.rear_rad)
     roof_end = max(roof_end, header + 0.3)
     points = [
-        (0.0, 0.72 * hood), (0.04, 0.86 * hood), (0.22, hood), (shape.cowl, cowl_height),
-        (header, 0.965 * h), (header + 0.45 * (roof_end - header), h), (roof_end, 0.95 * h),
-        (max(deck_start, roof_end + 0.05), deck_height), (length - 0.05, tail_height + 0.02), (length, 0.92 * tail_height),
-    ]  # fmt: skip
+        (0.0, 0.80 * hood),
+        (0.04, 0.92 * hood),
+        (0.18, hood),
+        (shape.cowl, cowl_height),
+        (header, 0.965 * h),
+        (header + 0.45 * (roof_end - header), h),
+        (roof_end, 0.95 * h),
+        (max(deck_start, roof_end + 0.05), deck_height),
+        (length - 0.05, tail_height + 0.02),
+        (length, 0.92 * tail_height),
+    ]
     if shape.style == "pickup":
         points[-3:] = [(points[-3][0], deck_height), (length - 0.03, deck_height), (length, deck_height - 0.03)]
     return np.array(points)
@@ -131,13 +145,13 @@ def top_profile(shape: CarShape) -> Float64:
 
 def _stations(shape: CarShape) -> Float64:
     """Distances of the cross sections: dense at the ends and about the wheel arches, float64 [k]."""
-    dense = [np.linspace(0, 0.25, 7), np.linspace(shape.length - 0.2, shape.length, 6)]
+    dense = [np.linspace(0, 0.25, 6), np.linspace(shape.length - 0.2, shape.length, 5)]
     for axle in shape.axles:
-        reach = shape.wheel_radius + 0.1
-        dense.append(np.linspace(axle - reach, axle + reach, 27))
-    every = np.concatenate([np.arange(0, shape.length, 0.09), top_profile(shape)[:, 0], *dense])
+        dense.append(axle + shape.arch_radius * np.sin(np.linspace(-np.pi / 2, np.pi / 2, 13)))
+    every = np.concatenate([np.arange(0, shape.length, 0.14), top_profile(shape)[:, 0], *dense])
     every = np.unique(np.clip(every, 0, shape.length).round(3))
-    return every[np.concatenate([[True], np.diff(every) > 0.012])]
+    kept: Float64 = every[np.concatenate([[True], np.diff(every) > 0.012])]
+    return kept
 
 
 def _smooth(x: Float64, profile: Float64, width: float) -> Float64:
@@ -147,32 +161,37 @@ def _smooth(x: Float64, profile: Float64, width: float) -> Float64:
     return rounded
 
 
-def _half_section(shape: CarShape, top: float, bottom: float, half: float, belt: float) -> Float64:
-    """One side of a cross section from the middle of the floor to the middle of the top: (y, z), float64 [32, 2]."""
+def _arch(shape: CarShape, x: float) -> float:
+    """Height of the wheel arch at distance x from the front, 0 where there is none."""
+    for axle in shape.axles:
+        if abs(x - axle) < shape.arch_radius - 1e-3:
+            return shape.wheel_radius + math.sqrt(shape.arch_radius**2 - (x - axle) ** 2)
+    return 0.0
+
+
+def _half_section(shape: CarShape, top: float, bottom: float, half: float, belt: float, arch: float) -> Float64:
+    """One side of a cross section from the middle of the floor to the middle of the top: (y, z), float64 [27, 2]."""
     radius = min(0.11 if shape.style != "van" else 0.16, 0.35 * (top - bottom))
     shoulder = min(belt, top - radius)
     sill = bottom + 0.07
-    z_side = np.linspace(sill, shoulder, 13)
     middle, reach = 0.45 * (bottom + shoulder) + 0.1 * shoulder, max(shoulder - bottom, 0.1)
+    z_side = np.linspace(min(max(sill, arch), shoulder), shoulder, 9)
     y_side = half * (1 - 0.10 * ((z_side - middle) / reach) ** 2)
-    z_glass = np.linspace(shoulder, top - radius, 6)[1:]
+    if arch > sill:
+        inner = half - _WELL_DEPTH
+        floor = np.array([[0, bottom], [0.5 * inner, bottom], [inner, bottom], [inner, z_side[0]]])
+    else:
+        floor = np.array([[0, bottom], [0.5 * half, bottom], [0.86 * half, bottom], [0.95 * half, sill - 0.03]])
+    z_glass = np.linspace(shoulder, top - radius, 5)[1:]
     y_glass = y_side[-1] - (z_glass - shoulder) * math.tan(shape.tumblehome_rad)
     turn = np.linspace(0, math.pi / 2, 6)[1:]
-    y_last, across = y_glass[-1], min(1.6 * radius, 0.45 * half)
-    y_arc = y_last - across * (1 - np.cos(turn))
+    across = min(1.6 * radius, 0.45 * half)
+    y_arc = y_glass[-1] - across * (1 - np.cos(turn))
     z_arc = top - radius + radius * np.sin(turn)
-    inner = y_arc[-1] * np.linspace(1, 0, 6)[1:]
-    y = np.concatenate([half * np.array([0.0, 0.5, 0.86]), [0.95 * half], y_side[1:], y_glass, y_arc, inner])
-    z = np.concatenate([np.full(3, bottom), [sill - 0.03], z_side[1:], z_glass, z_arc, np.full(5, top)])
+    y = np.concatenate([floor[:, 0], y_side, y_glass, y_arc, y_arc[-1] * np.linspace(1, 0, 6)[1:]])
+    z = np.concatenate([floor[:, 1], z_side, z_glass, z_arc, np.full(5, top)])
     crown = np.clip((z - (top - radius)) / radius, 0, 1) * 0.05 * (y / half) ** 2
     return np.stack([y, z - crown], axis=1)
-
-
-def _cut_arches(shape: CarShape, x: float, section: Float64, half: float) -> None:
-    """Push the side inwards where the wheels turn, in place."""
-    for axle in shape.axles:
-        inside = (x - axle) ** 2 + (section[:, 1] - shape.wheel_radius) ** 2 < (shape.wheel_radius + 0.06) ** 2
-        section[inside, 0] = np.minimum(section[inside, 0], half - 0.26)
 
 
 def _body(shape: CarShape) -> list[Part]:
@@ -180,15 +199,14 @@ def _body(shape: CarShape) -> list[Part]:
     x = _stations(shape)
     top = _smooth(x, top_profile(shape), 0.13)
     nose, tail = np.clip(1 - x / 0.6, 0, 1), np.clip(1 - (shape.length - x) / 0.6, 0, 1)
-    bottom = shape.clearance + 0.10 * nose**2 + 0.14 * tail**2
+    bottom = shape.clearance + 0.05 * nose**2 + 0.12 * tail**2
     front, rear = np.clip(1 - x / 1.1, 0, 1), np.clip(1 - (shape.length - x) / 1.1, 0, 1)
     half = shape.width / 2 * (1 - shape.taper_front * front**2.6 - shape.taper_rear * rear**2.6)
     belt = shape.belt_height + 0.03 * (x / shape.length - 0.5)
     bed = shape.length - shape.deck + 0.03
     rings = []
     for i in range(len(x)):
-        section = _half_section(shape, top[i], bottom[i], half[i], belt[i])
-        _cut_arches(shape, float(x[i]), section, half[i])
+        section = _half_section(shape, top[i], bottom[i], half[i], belt[i], _arch(shape, float(x[i])))
         if shape.style == "pickup" and bed < x[i] < shape.length - 0.07:
             inside = (section[:, 0] < half[i] - 0.14) & (section[:, 1] > 0.6)
             section[inside, 1] = 0.55 * shape.belt_height + 0.1
@@ -217,11 +235,11 @@ def _attachments(shape: CarShape, rng: np.random.Generator) -> list[Part]:
     parts = [mirror, mirrored(mirror)]
     roof_middle = -0.52 * shape.length
     if shape.style in ("estate", "suv", "minivan") and rng.random() < 0.5:
-        rail = box((roof_middle - 0.1, 0.55 * shape.width / 2, h + 0.015), (0.3 * shape.length, 0.035, 0.05))
+        rail = box((roof_middle - 0.05, 0.55 * shape.width / 2, h - 0.03), (0.26 * shape.length, 0.035, 0.09))
         parts += [rail, mirrored(rail)]
     if shape.style not in ("pickup", "van") and rng.random() < 0.06:
         half_box = (0.75, 0.32, 0.16)
-        parts.append(superellipsoid((roof_middle, 0, h + 0.15), half_box, (0.5, 0.5), steps=(16, 9)))
+        parts.append(superellipsoid((roof_middle, 0, h + 0.11), half_box, (0.5, 0.5), steps=(16, 9)))
     if shape.style in ("coupe", "sedan") and rng.random() < 0.12:
         parts.append(box((-(shape.length - 0.15), 0, shape.belt_height + 0.16), (0.2, 0.75 * shape.width, 0.03)))
     if shape.style == "suv" and rng.random() < 0.2:

@@ -11,8 +11,19 @@ import numpy as np
 from edge.frames import Float64
 from train.objects.parametric_person import random_body, rider
 from train.objects.primitives import (
-    Part, box, capsule, curve, frame_of, lathe, loft, mirrored, superellipsoid, torus, tube,
-)  # fmt: skip
+    Part,
+    box,
+    capsule,
+    curve,
+    frame_of,
+    lathe,
+    loft,
+    mirrored,
+    superellipsoid,
+    torus,
+    tube,
+    vec,
+)
 
 RIDER_PROBABILITY = 0.3
 _KINDS = ("naked", "sport", "cruiser", "enduro", "touring", "scooter")
@@ -48,12 +59,30 @@ def draw_machine(kind: str, rng: np.random.Generator) -> Machine:
     def pick(low: float, high: float) -> float:
         return float(rng.uniform(low, high))
 
-    base = {"naked": (1.37, 1.48), "sport": (1.37, 1.45), "cruiser": (1.55, 1.70), "enduro": (1.42, 1.52),
-            "touring": (1.48, 1.60), "scooter": (1.22, 1.42)}[kind]  # fmt: skip
-    seat = {"naked": (0.78, 0.83), "sport": (0.80, 0.85), "cruiser": (0.66, 0.72), "enduro": (0.84, 0.93),
-            "touring": (0.78, 0.84), "scooter": (0.75, 0.80)}[kind]  # fmt: skip
-    bar = {"naked": (1.00, 1.08), "sport": (0.88, 0.95), "cruiser": (1.02, 1.22), "enduro": (1.10, 1.20),
-           "touring": (1.05, 1.14), "scooter": (0.98, 1.05)}[kind]  # fmt: skip
+    base = {
+        "naked": (1.37, 1.48),
+        "sport": (1.37, 1.45),
+        "cruiser": (1.55, 1.70),
+        "enduro": (1.42, 1.52),
+        "touring": (1.48, 1.60),
+        "scooter": (1.22, 1.42),
+    }[kind]
+    seat = {
+        "naked": (0.78, 0.83),
+        "sport": (0.80, 0.85),
+        "cruiser": (0.66, 0.72),
+        "enduro": (0.84, 0.93),
+        "touring": (0.78, 0.84),
+        "scooter": (0.75, 0.80),
+    }[kind]
+    bar = {
+        "naked": (1.00, 1.08),
+        "sport": (0.88, 0.95),
+        "cruiser": (1.02, 1.22),
+        "enduro": (1.10, 1.20),
+        "touring": (1.05, 1.14),
+        "scooter": (0.98, 1.05),
+    }[kind]
     scooter = kind == "scooter"
     wheelbase = pick(*base)
     foot = {"cruiser": 0.62, "sport": 0.30, "scooter": 0.62}.get(kind, 0.45) * wheelbase
@@ -79,7 +108,7 @@ def _wheel(center: Float64, radius: float, tyre: float) -> list[Part]:
     rim, h = radius - 1.7 * tyre, 0.6 * tyre
     parts.append(lathe(center, [(rim, h), (rim - 0.02, 0.7 * h), (rim - 0.02, -0.7 * h), (rim, -h)], 32))
     parts.append(lathe(center, [(0.05, 0.06), (0.05, -0.06)], 12))
-    parts.append(lathe(center + [0, 0.06, 0], [(0.06, 0), (min(0.15, rim - 0.03), 0)], 20))
+    parts.append(lathe(center + vec(0, 0.06, 0), [(0.06, 0), (min(0.15, rim - 0.03), 0)], 20))
     for angle in 2 * math.pi * np.arange(5) / 5:
         out = np.array([math.cos(angle), 0, math.sin(angle)])
         parts.append(tube([center + 0.04 * out, center + (rim - 0.01) * out], 0.017, 5))
@@ -103,13 +132,13 @@ def _hull(stations: list[tuple[float, float, float, float]], exponent: float = 0
 
 def _fork(m: Machine, stem: Float64, axle: Float64) -> list[Part]:
     """Fork legs, front mudguard, head lamp."""
-    parts = [tube([stem + [0, 0.09 * s, -0.04], axle + [0, 0.09 * s, 0]], 0.025, 8) for s in (1, -1)]
+    parts = [tube([stem + vec(0, 0.09 * s, -0.04), axle + vec(0, 0.09 * s, 0)], 0.025, 8) for s in (1, -1)]
     angle = np.radians(np.linspace(35, 160, 10))
     arc = axle + (m.front_radius + 0.025) * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     for side in (0.04, -0.04, 0.0):
-        parts.append(tube(arc + [0, side, 0], 0.022, 5))
+        parts.append(tube(arc + vec(0, side, 0), 0.022, 5))
     if m.kind not in ("sport", "touring"):
-        lamp = stem + [0.10, 0, -0.10]
+        lamp = stem + vec(0.10, 0, -0.10)
         parts.append(superellipsoid(lamp, (0.08, 0.09, 0.09), (0.8, 0.8), steps=(12, 9)))
     return parts
 
@@ -117,12 +146,12 @@ def _fork(m: Machine, stem: Float64, axle: Float64) -> list[Part]:
 def _bars(m: Machine, stem: Float64) -> tuple[list[Part], Float64]:
     """Handle bar with mirrors and the grips [2, 3]."""
     grip = np.array([stem[0] - (0.05 if m.kind == "sport" else 0.16), m.bar_half - 0.05, m.bar_height])
-    end = grip + [-0.02, 0.06, -0.01]
-    side = tube(curve([stem, stem + [0.0, 0.1, 0.04], grip + [0.03, -0.1, 0], end], 10), 0.016, 7)
+    end = grip + vec(-0.02, 0.06, -0.01)
+    side = tube(curve([stem, stem + vec(0.0, 0.1, 0.04), grip + vec(0.03, -0.1, 0), end], 10), 0.016, 7)
     parts = [side, mirrored(side)]
-    mirror_at = grip + [0.10, 0.02, 0.17]
+    mirror_at = grip + vec(0.10, 0.02, 0.17)
     mirror = superellipsoid(mirror_at, (0.02, 0.07, 0.045), (0.7, 0.7), steps=(10, 7))
-    stalk = tube([grip + [0.03, -0.06, 0.01], mirror_at], 0.007, 5)
+    stalk = tube([grip + vec(0.03, -0.06, 0.01), mirror_at], 0.007, 5)
     parts += [mirror, mirrored(mirror), stalk, mirrored(stalk)]
     return parts, np.stack([grip, grip * np.array([1, -1, 1])])
 
@@ -134,15 +163,24 @@ def _motorcycle_body(m: Machine, stem: Float64, rng: np.random.Generator) -> lis
     top = seat + rng.uniform(0.10, 0.18)
     half = rng.uniform(0.13, 0.17)
     parts = _hull(
-        [(tank_end - 0.03, seat - 0.02, 0.07, 0.06), (0.65 * tank_end + 0.35 * tank_front, top - 0.13, half, 0.12),
-         (0.3 * tank_end + 0.7 * tank_front, top - 0.12, half, 0.13), (tank_front + 0.04, top - 0.13, 0.09, 0.09)]
-    )  # fmt: skip
+        [
+            (tank_end - 0.03, seat - 0.02, 0.07, 0.06),
+            (0.65 * tank_end + 0.35 * tank_front, top - 0.13, half, 0.12),
+            (0.3 * tank_end + 0.7 * tank_front, top - 0.12, half, 0.13),
+            (tank_front + 0.04, top - 0.13, 0.09, 0.09),
+        ]
+    )
     tail = {"cruiser": -0.18, "touring": -0.35}.get(m.kind, -0.24)
     rise = 0.10 if m.kind in ("sport", "naked") else 0.05
     parts += _hull(
-        [(tail, seat + rise + 0.02, 0.06, 0.03), (0.5 * tail, seat + rise, 0.10, 0.055), (0.22 * w, seat - 0.05, 0.14, 0.06),
-         (0.38 * w, seat - 0.05, 0.12, 0.055), (tank_end + 0.02, seat - 0.04, 0.08, 0.05)]
-    )  # fmt: skip
+        [
+            (tail, seat + rise + 0.02, 0.06, 0.03),
+            (0.5 * tail, seat + rise, 0.10, 0.055),
+            (0.22 * w, seat - 0.05, 0.14, 0.06),
+            (0.38 * w, seat - 0.05, 0.12, 0.055),
+            (tank_end + 0.02, seat - 0.04, 0.08, 0.05),
+        ]
+    )
     low = 0.24 if m.kind == "enduro" else 0.17
     middle = 0.52 * w
     parts.append(superellipsoid((middle - 0.06, 0, low + 0.17), (0.25, 0.18, 0.16), (0.5, 0.5), steps=(14, 9)))
@@ -150,14 +188,22 @@ def _motorcycle_body(m: Machine, stem: Float64, rng: np.random.Generator) -> lis
     parts.append(superellipsoid((middle + 0.10, 0, low + 0.38), (0.11, 0.13, 0.17), (0.4, 0.4), tilt, (12, 9)))
     for sign in (1, -1):
         pivot = np.array([0.36 * w, 0.11 * sign, m.rear_radius + 0.06])
-        parts.append(tube([pivot, [0, 0.11 * sign, m.rear_radius]], [0.035, 0.028], 7))
-        parts.append(tube([stem + [0, 0.05 * sign, -0.12], [middle + 0.12, 0.13 * sign, low + 0.3], pivot], 0.022, 7))
+        cradle = vec(middle + 0.12, 0.13 * sign, low + 0.3)
+        parts.append(tube([pivot, vec(0, 0.11 * sign, m.rear_radius)], [0.035, 0.028], 7))
+        parts.append(tube([stem + vec(0, 0.05 * sign, -0.12), cradle, pivot], 0.022, 7))
         parts.append(tube([[0.02, 0.13 * sign, m.rear_radius], [0.12 * w, 0.12 * sign, seat - 0.1]], 0.03, 7))
-    pipe = curve([[middle + 0.22, -0.08, low + 0.36], [middle + 0.24, -0.12, low], [0.35 * w, -0.16, low + 0.02],
-                  [0.12 * w, -0.19, m.rear_radius + 0.04]], 12)  # fmt: skip
+    pipe = curve(
+        [
+            [middle + 0.22, -0.08, low + 0.36],
+            [middle + 0.24, -0.12, low],
+            [0.35 * w, -0.16, low + 0.02],
+            [0.12 * w, -0.19, m.rear_radius + 0.04],
+        ],
+        12,
+    )
     parts.append(tube(pipe, 0.022, 7))
     high = 0.20 if m.kind in ("enduro", "sport") else 0.0
-    parts.append(capsule(pipe[-1], pipe[-1] + [-0.42, -0.02, 0.06 + high], 0.045, 0.055))
+    parts.append(capsule(pipe[-1], pipe[-1] + vec(-0.42, -0.02, 0.06 + high), 0.045, 0.055))
     if m.kind in ("sport", "touring"):
         parts += _fairing(m, stem)
     if m.kind == "touring":
@@ -173,14 +219,27 @@ def _fairing(m: Machine, stem: Float64) -> list[Part]:
     nose = float(stem[0]) + 0.28
     high = 0.10 if m.kind == "touring" else 0.0
     parts = _hull(
-        [(nose, stem[2] - 0.18, 0.05, 0.05), (nose - 0.12, stem[2] - 0.12, 0.17, 0.14),
-         (nose - 0.28, stem[2] - 0.12, 0.21, 0.20), (0.60 * m.wheelbase, 0.52, 0.24, 0.30), (0.40 * m.wheelbase, 0.42, 0.2, 0.2)]
-    )  # fmt: skip
+        [
+            (nose, stem[2] - 0.18, 0.05, 0.05),
+            (nose - 0.12, stem[2] - 0.12, 0.17, 0.14),
+            (nose - 0.28, stem[2] - 0.12, 0.21, 0.20),
+            (0.60 * m.wheelbase, 0.52, 0.24, 0.30),
+            (0.40 * m.wheelbase, 0.42, 0.2, 0.2),
+        ]
+    )
     top = np.array([nose - 0.32, 0, stem[2] + 0.16 + 2.5 * high])
     foot = np.array([nose - 0.10, 0, stem[2] - 0.02])
     width = np.array([0, 0.16, 0])
-    corners = np.array([foot - width, foot + [0.04, 0, 0], foot + width, top + 0.8 * width, top + [0.03, 0, 0.03],
-                        top - 0.8 * width])  # fmt: skip
+    corners = np.array(
+        [
+            foot - width,
+            foot + vec(0.04, 0, 0),
+            foot + width,
+            top + 0.8 * width,
+            top + vec(0.03, 0, 0.03),
+            top - 0.8 * width,
+        ]
+    )
     parts.append((corners, np.array([[0, 1, 5], [1, 4, 5], [1, 2, 3], [1, 3, 4]])))
     return parts
 
@@ -189,25 +248,34 @@ def _scooter_body(m: Machine, stem: Float64, rng: np.random.Generator) -> list[P
     """Leg shield, floor, rear body, seat, and sometimes a top case."""
     w, seat = m.wheelbase, m.seat_height
     parts = _hull(
-        [(-0.34, seat - 0.16, 0.05, 0.05), (-0.15, seat - 0.22, 0.15, 0.15), (0.2 * w, seat - 0.25, 0.18, 0.19),
-         (0.42 * w, seat - 0.28, 0.14, 0.2)]
-    )  # fmt: skip
+        [
+            (-0.38, seat - 0.12, 0.06, 0.06),
+            (-0.20, seat - 0.18, 0.15, 0.15),
+            (0.18 * w, seat - 0.22, 0.18, 0.20),
+            (0.38 * w, seat - 0.27, 0.15, 0.22),
+            (0.43 * w, seat - 0.32, 0.11, 0.18),
+        ]
+    )
     parts += _hull(
-        [(-0.30, seat + 0.0, 0.08, 0.03), (-0.05, seat + 0.01, 0.14, 0.05), (0.25 * w, seat - 0.02, 0.15, 0.05),
-         (0.43 * w, seat - 0.05, 0.09, 0.04)]
-    )  # fmt: skip
+        [
+            (-0.34, seat - 0.02, 0.08, 0.04),
+            (-0.05, seat - 0.02, 0.14, 0.06),
+            (0.25 * w, seat - 0.05, 0.15, 0.06),
+            (0.42 * w, seat - 0.08, 0.09, 0.05),
+        ]
+    )
     parts.append(superellipsoid((0.52 * w, 0, 0.29), (0.24, 0.17, 0.06), (0.5, 0.5), steps=(14, 7)))
     slope = frame_of((-math.tan(m.rake_rad), 0, 1.0))
     shield = np.array([0.72 * w, 0, 0.58])
     parts.append(superellipsoid(shield, (0.07, 0.23, 0.34), (0.6, 0.7), slope @ np.diag([-1.0, -1, 1]), (16, 9)))
-    parts.append(superellipsoid(stem + [0.03, 0, 0.04], (0.12, 0.17, 0.10), (0.7, 0.8), steps=(14, 9)))
+    parts.append(superellipsoid(stem + vec(0.03, 0, 0.04), (0.12, 0.17, 0.10), (0.7, 0.8), steps=(14, 9)))
     parts.append(superellipsoid((0.02, 0.12, m.rear_radius + 0.02), (0.22, 0.07, 0.10), (0.6, 0.6), steps=(12, 7)))
     parts.append(capsule((0.1, -0.15, m.rear_radius), (-0.28, -0.16, m.rear_radius + 0.08), 0.05, 0.055))
     if rng.random() < 0.35:
-        parts.append(superellipsoid((-0.36, 0, seat + 0.2), (0.2, 0.2, 0.16), (0.5, 0.5), steps=(12, 7)))
+        parts.append(superellipsoid((-0.30, 0, seat + 0.16), (0.2, 0.2, 0.15), (0.5, 0.5), steps=(12, 7)))
     if rng.random() < 0.3:
-        top = stem + [0.0, 0, 0.42]
-        foot = stem + [0.14, 0, 0.08]
+        top = stem + vec(0.0, 0, 0.42)
+        foot = stem + vec(0.14, 0, 0.08)
         width = np.array([0, 0.2, 0])
         corners = np.array([foot - width, foot + width, top + width, top - width])
         parts.append((corners, np.array([[0, 1, 2], [0, 2, 3]])))

@@ -15,6 +15,11 @@ Part = tuple[Float64, NDArray[np.int64]]
 """Vertices float64 [n, 3] in metres and faces int64 [m, 3]."""
 
 
+def vec(x: float, y: float, z: float) -> Float64:
+    """A point or offset, float64 [3]."""
+    return np.array([x, y, z], dtype=float)
+
+
 def join(parts: Sequence[Part]) -> tuple[Float32, Int32]:
     """One triangle soup of many parts: vertices float32 [n, 3], faces int32 [m, 3]."""
     offsets = np.cumsum([0] + [len(v) for v, _ in parts[:-1]])

@@ -13,6 +13,17 @@ Int32 = NDArray[np.int32]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def bounds(points: Float32) -> tuple[Float32, Float32]:  # pragma: no cover - compiled
+    """Lowest and highest coordinates of points [n, 3], n >= 1; float32 [3] each."""
+    low, high = points[0].copy(), points[0].copy()
+    for i in range(1, len(points)):
+        for k in range(3):
+            low[k] = min(low[k], points[i, k])
+            high[k] = max(high[k], points[i, k])
+    return low, high
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def face_areas(vertices: Float32, faces: Int32, out: Float64) -> float:  # pragma: no cover - compiled
     """Area of every face [m] into ``out`` (m^2); returns the sum."""
     total = 0.0
