@@ -138,6 +138,26 @@ class RadarFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class PointResponse:
+    """What a point target looks like in a heatmap: lets a detector undo interpolation and near-field errors.
+
+    Args:
+        range_fit, angle_fit: float64 [9] each, coefficients of the sub-bin corrections (edge/dsp/interpolation.py).
+        gain: float32 [angle], factor that compensates the antenna gain in the heatmap's power.
+        range_bias_m2: the two-way path's mean curvature; a target at (r, u) appears at r + bias (1 - u^2) / r.
+        cosine_bias_m: slope of the curvature along the row, which tilts the wavefront.
+        focus_inverse_m: half the inverse of the range whose curvature is compensated everywhere; negative: each its own.
+    """
+
+    range_fit: Float64
+    angle_fit: Float64
+    gain: Float32
+    range_bias_m2: float
+    cosine_bias_m: float
+    focus_inverse_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class Heatmap:
     """Range-angle power of one radar.
 
@@ -148,6 +168,7 @@ class Heatmap:
         power: float32 [angle, range], linear, range innermost; a view into the imager's buffer, valid until its next frame.
         direction_cosine: float32 [angle], uniform over one period, ascending, -1/(2 pitch) .. +1/(2 pitch).
         range_m: float32 [range], from the phase centre of the array.
+        response: how a point target appears; None: unknown, detections are interpolated by plain parabolas.
     """
 
     radar: RadarId
@@ -156,6 +177,7 @@ class Heatmap:
     power: Float32
     direction_cosine: Float32
     range_m: Float32
+    response: PointResponse | None = None
 
 
 @dataclass(frozen=True, slots=True)

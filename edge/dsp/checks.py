@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be wrong with a frame's samples: refusals with their cause, and a report of what was noticed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import CaptureError
+from edge.frames import Layout, LossCause, RadarFrame
+
+
+class FrameRejected(CaptureError):  # noqa: N818 - it is a verdict on the frame, named as in the architecture
+    """A frame whose samples cannot become a heatmap; ``cause`` is counted by the pipeline.
+
+    Args:
+        cause: which counter the loss belongs to.
+        what, value, allowed, action: as in RfconstructError.
+    """
+
+    def __init__(
+        self, cause: LossCause, what: str, *, value: object = None, allowed: str = "", action: str = ""
+    ) -> None:
+        self.cause = cause
+        super().__init__(what, value=value, allowed=allowed, action=action)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameReport:
+    """What was noticed while a frame was processed.
+
+    Args:
+        loops: loops that were summed.
+        saturated_share: share of the summed I and Q codes at the rails.
+        dead: names of channels that gave one constant value: "RX5" (with every transmitter), "TX3" or "TX3 RX5".
+    """
+
+    loops: int = 0
+    saturated_share: float = 0.0
+    dead: tuple[str, ...] = ()
+
+
+def reject_all_zero(frame: RadarFrame) -> FrameRejected:
+    """Refusal of a frame without a single non-zero sample."""
+    return FrameRejected(
+        LossCause.ALL_ZERO,
+        f"{frame.radar} frame {frame.number}: every sample is zero",
+        action="check that the board was armed and the capture card received data",
+    )
+
+
+def reject_saturated(frame: RadarFrame, share: float, allowed: float) -> FrameRejected:
+    """Refusal of a frame with too many codes at the rails."""
+    return FrameRejected(
+        LossCause.SATURATED,
+        f"{frame.radar} frame {frame.number}: ADC saturated",
+        value=f"{100.0 * share:.3g} % of the codes at the rails",
+        allowed=f"at most {100.0 * allowed:.3g} % (heatmap.max_saturated_share)",
+        action="lower the receiver gain of the profile or move strong reflectors away",
+    )
+
+
+def dead_names(dead: NDArray[np.uint8], layout: Layout) -> tuple[str, ...]:
+    """Names of dead channels, whole receivers and whole transmitters first.
+
+    Args:
+        dead: [slots, receivers], not zero where the channel is dead.
+        layout: of the frame; in a cascade slot s fires TX ``slots - s``, elsewhere slots are named in firing order.
+    Returns:
+        For example ("RX5", "TX3", "TX1 RX2").
+    """
+    transmitter = [layout.slots - s if layout.kind == "cascade" else s + 1 for s in range(layout.slots)]
+    by_receiver = dead.all(axis=0)
+    by_slot = dead.all(axis=1) & (not by_receiver.all())
+    names = [f"RX{r + 1}" for r in np.flatnonzero(by_receiver)]
+    names += [f"TX{transmitter[s]}" for s in np.flatnonzero(by_slot)]
+    single = dead.astype(bool) & ~by_receiver[None, :] & ~by_slot[:, None]
+    names += [f"TX{transmitter[s]} RX{r + 1}" for s, r in np.argwhere(single)]
+    return tuple(names)

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detector: two-dimensional CFAR on a heatmap, local maxima, sub-bin positions, strongest first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.config import CfarSettings, require
+from edge.dsp.interpolation import PARABOLA
+from edge.dsp.kernels_cfar import mean_decisions, mean_peaks, rank_decisions, rank_peaks, ring_mean_kernel
+from edge.dsp.kernels_detect import refine, strongest
+from edge.dsp.threshold import cfar_scale, os_rank
+from edge.frames import Detections, Float32, Heatmap
+
+if TYPE_CHECKING:
+    from edge.rig import Radar
+
+
+@dataclass(frozen=True, slots=True)
+class RingTables:
+    """What the CFAR needs for every range cell: the ring is cut at both ends of range.
+
+    Args:
+        first: first tested range cell; nearer ones take no part in any ring.
+        cells: int64 [R], training cells.
+        factor: float32 [R], threshold over the noise statistic (mean or ordered statistic).
+        inverse_count: float32 [R], 1 / cells.
+        allowed: int64 [R], cells - rank.
+    """
+
+    first: int
+    cells: NDArray[np.int64]
+    factor: Float32
+    inverse_count: Float32
+    allowed: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, settings: CfarSettings, ranges: int, first: int) -> RingTables:
+        """Tables for ``ranges`` cells of which those below ``first`` do not count."""
+        r = np.arange(ranges)
+
+        def inside(half_width: int) -> NDArray[np.int64]:
+            low, high = np.maximum(r - half_width, first), np.minimum(r + half_width, ranges - 1)
+            return np.asarray(np.maximum(high - low + 1, 0), dtype=np.int64)
+
+        box, guard = inside(settings.train_range), inside(settings.guard_range)
+        cells = box * (2 * settings.train_angle + 1) - guard * (2 * settings.guard_angle + 1)
+        rank = [os_rank(int(n), settings.os_quantile) for n in cells]
+        scale: dict[int, float] = {}
+        for n, k in zip(cells.tolist(), rank, strict=True):
+            if n not in scale:
+                scale[n] = cfar_scale(settings.kind, n, settings.p_fa, k) if n > 0 else np.inf
+        factor = np.array([scale[n] for n in cells.tolist()], dtype=np.float32)
+        inverse = (1.0 / np.maximum(cells, 1)).astype(np.float32)
+        return cls(first, cells, factor, inverse, cells - np.array(rank, dtype=np.int64))
+
+
+class Detector:
+    """CFAR detection, local maxima and sub-bin estimation for one radar.
+
+    The noise around a cell comes from a ring in range and angle, wrapped in angle, cut at both ends of range and at
+    ``min_range_m``; each number of remaining cells has its own factor for the same designed probability. The design
+    holds for independent exponential cells; a heatmap's cells are correlated by windows and zero padding.
+
+    Args:
+        radar: which radar; only its identity is used, axes come with the heatmap.
+        settings: ring, probability, kind, limits.
+    """
+
+    def __init__(self, radar: Radar, settings: CfarSettings) -> None:
+        self.radar, self.settings = radar.radar, settings
+        self.cut = 0
+        """Detections of the last frame that were left out beyond ``max_detections``."""
+        self._ring = (settings.guard_angle, settings.train_angle, settings.guard_range, settings.train_range)
+        self._shape = (0, 0)
+        self._first_range_m = np.nan
+        self._axes = np.zeros(7)
+        self._value = np.zeros(settings.max_detections, dtype=np.float32)
+        self._index = np.zeros(settings.max_detections, dtype=np.int64)
+        self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
+        self._ring_mean = ring_mean_kernel(*self._ring)
+
+    def process(self, heatmap: Heatmap) -> Detections:
+        """Detections of one heatmap; the columns are the caller's to keep.
+
+        Args:
+            heatmap: power [angle, range]; its response improves the sub-bin estimates.
+        Returns:
+            Detections over the whole direction axis, strongest first, at most ``max_detections``; see ``cut``.
+        Raises:
+            ConfigError: the ring does not fit onto the angle axis.
+        """
+        self._prepare(heatmap)
+        count = self._find(heatmap.power)
+        kept = strongest(heatmap.power, self._cells, count, self.settings.max_detections, self._value, self._index)
+        self.cut = count - kept
+        self._refine(heatmap, kept)
+        columns = self._columns[:, :kept].copy()
+        doppler = np.full(kept, np.nan, dtype=np.float32)
+        return Detections(
+            *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, columns[0], columns[1], columns[2]),
+            *(doppler, columns[3]),
+        )
+
+    def decisions(self, heatmap: Heatmap) -> NDArray[np.bool_]:
+        """CFAR decision of every cell [angle, range] before the local-maximum test; for analysis, not for the road."""
+        self._prepare(heatmap)
+        decided = np.zeros(heatmap.power.shape, dtype=np.bool_)
+        tables = self._tables
+        if self.settings.kind == "ca":
+            self._estimate(heatmap.power)
+            mean_decisions(heatmap.power, self._noise, tables.factor, tables.first, decided)
+        else:
+            rank_decisions(heatmap.power, tables.first, self._ring, tables.factor, tables.allowed, decided)
+        return decided
+
+    def noise(self, heatmap: Heatmap) -> Float32:
+        """Mean of every cell's ring [angle, range], as CA-CFAR uses it; valid until the next call."""
+        self._prepare(heatmap)
+        self._estimate(heatmap.power)
+        return self._noise
+
+    def _prepare(self, heatmap: Heatmap) -> None:
+        """Buffers and tables, made again only when the axes change."""
+        range_m = heatmap.range_m
+        if heatmap.power.shape == self._shape and float(range_m[0]) == self._first_range_m:
+            return
+        angles, ranges = heatmap.power.shape
+        train = self.settings.train_angle
+        require(2 * train < angles, "cfar.train_angle", train, f"at most {(angles - 1) // 2} for {angles} angle bins")
+        first = int(np.searchsorted(range_m, self.settings.min_range_m))
+        self._tables = RingTables.of(self.settings, ranges, first)
+        self._line = np.zeros(ranges + 2 * self.settings.train_range, dtype=np.float32)
+        self._full = np.zeros((angles + 2 * train, ranges), dtype=np.float32)
+        self._side = np.zeros_like(self._full)
+        self._noise = np.zeros((angles, ranges), dtype=np.float32)
+        self._cells = np.zeros(angles * (ranges + 1) // 4 + 1, dtype=np.int64)
+        self._estimates = np.zeros(len(self._cells), dtype=np.float32)
+        self._peak = np.zeros(ranges, dtype=np.float32)
+        self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
+        self._unit_gain = np.ones(angles, dtype=np.float32)
+        self._shape, self._first_range_m = (angles, ranges), float(range_m[0])
+
+    def _estimate(self, power: Float32) -> None:
+        tables = self._tables
+        self._ring_mean(power, tables.first, tables.inverse_count, self._line, self._full, self._side, self._noise)
+
+    def _find(self, power: Float32) -> int:
+        """Local maxima above the threshold into ``_cells`` and ``_estimates``."""
+        tables = self._tables
+        if self.settings.kind == "ca":
+            self._estimate(power)
+            found = mean_peaks(power, self._noise, tables.factor, tables.first, self._cells, self._estimates)
+        else:
+            found = rank_peaks(
+                *(power, tables.first, self._ring, tables.factor, tables.allowed, self._peak, self._scratch),
+                *(self._cells, self._estimates),
+            )
+        return int(found)
+
+    def _refine(self, heatmap: Heatmap, count: int) -> None:
+        response, range_m, cosine = heatmap.response, heatmap.range_m, heatmap.direction_cosine
+        last = len(range_m) - 1
+        self._axes[0], self._axes[1] = range_m[0], (float(range_m[last]) - float(range_m[0])) / last
+        self._axes[2] = cosine[0]
+        self._axes[3] = (float(cosine[-1]) - float(cosine[0])) / (len(cosine) - 1)
+        gain, range_fit, angle_fit = self._unit_gain, PARABOLA, PARABOLA
+        self._axes[4:] = 0.0
+        if response is not None:
+            gain, range_fit, angle_fit = response.gain, response.range_fit, response.angle_fit
+            self._axes[4], self._axes[5] = response.range_bias_m2, response.cosine_bias_m
+            self._axes[6] = response.focus_inverse_m
+        refine(
+            *(heatmap.power, gain, self._cells, self._index, self._estimates, count),
+            *(range_fit, angle_fit, self._axes, self._columns),
+        )

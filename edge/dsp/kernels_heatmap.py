@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels from raw int16 samples to range-angle power: loop sum, range FFT, channel gather, angle FFT, power.
+
+Both FFTs are radix-4 decimation in frequency, in place, vectorised across transforms: real and imaginary planes of one
+flat float32 buffer, lanes innermost, literal strides (closure constants), digit-reversed rows undone by the store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import float32, int32, int64, njit, types
+
+RAIL = 32767
+OPTIONS = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+
+RAW = types.Array(int32, 1, "C", readonly=True)
+"""Raw samples, two int16 in one int32, lower address in the lower half."""
+
+
+@njit(inline="always")
+def _butterfly(work, x, q, im, w1r, w1i, w2r, w2i, w3r, w3i, sign):  # type: ignore[no-untyped-def]
+    """Radix-4 butterfly on work[x + {0, q, 2q, 3q}], then the twiddles; ``sign`` of the exponent is +1 or -1."""
+    ar, ai = work[x], work[x + im]
+    br, bi = work[x + q], work[x + q + im]
+    cr, ci = work[x + 2 * q], work[x + 2 * q + im]
+    dr, di = work[x + 3 * q], work[x + 3 * q + im]
+    sr, si, tr, ti = ar + cr, ai + ci, ar - cr, ai - ci
+    ur, ui, vr, vi = br + dr, bi + di, sign * (di - bi), sign * (br - dr)
+    work[x], work[x + im] = sr + ur, si + ui
+    yr, yi = tr + vr, ti + vi
+    work[x + q], work[x + q + im] = yr * w1r - yi * w1i, yr * w1i + yi * w1r
+    yr, yi = sr - ur, si - ui
+    work[x + 2 * q], work[x + 2 * q + im] = yr * w2r - yi * w2i, yr * w2i + yi * w2r
+    yr, yi = tr - vr, ti - vi
+    work[x + 3 * q], work[x + 3 * q + im] = yr * w3r - yi * w3i, yr * w3i + yi * w3r
+
+
+@njit(inline="always")
+def _wide_stage(work, twiddle, first, groups, q, im):  # type: ignore[no-untyped-def]
+    """Stage of the range FFT: ``q`` = quarter x receivers contiguous lanes, twiddles expanded to the lanes."""
+    for g in range(groups):
+        for l in range(q):  # noqa: E741
+            t = first + l
+            w1r, w1i, w2r = twiddle[t], twiddle[t + q], twiddle[t + 2 * q]
+            w2i, w3r, w3i = twiddle[t + 3 * q], twiddle[t + 4 * q], twiddle[t + 5 * q]
+            _butterfly(work, 4 * q * g + l, q, im, w1r, w1i, w2r, w2i, w3r, w3i, float32(-1))
+
+
+@njit(inline="always")
+def _narrow_stage(work, twiddle, first, groups, quarter, lanes, im):  # type: ignore[no-untyped-def]
+    """Stage of the angle FFT: the inner loop runs over ``lanes`` range bins, twiddles are scalars."""
+    for g in range(groups):
+        for p in range(quarter):
+            t = first + 6 * p
+            w1r, w1i, w2r = twiddle[t], twiddle[t + 1], twiddle[t + 2]
+            w2i, w3r, w3i = twiddle[t + 3], twiddle[t + 4], twiddle[t + 5]
+            start = (4 * quarter * g + p) * lanes
+            for l in range(lanes):  # noqa: E741
+                _butterfly(work, start + l, quarter * lanes, im, w1r, w1i, w2r, w2i, w3r, w3i, float32(1))
+
+
+@njit(inline="always")
+def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
+    """Final radix-2 stage of lengths 2 * 4^k."""
+    for g in range(groups):
+        for l in range(lanes):  # noqa: E741
+            x = 2 * g * lanes + l
+            y = x + lanes
+            ar, ai, br, bi = work[x], work[x + im], work[y], work[y + im]
+            work[x], work[x + im] = ar + br, ai + bi
+            work[y], work[y + im] = ar - br, ai - bi
+
+
+@njit(inline="always")
+def _add_interleaved(adc, start, count, acc, to_i, to_q):  # type: ignore[no-untyped-def]
+    """Add one chirp of one device, [sample, rx] of packed (I, Q), to the sums; returns the largest magnitude."""
+    peak = float32(0)
+    for x in range(count):
+        packed = adc[start + x]
+        i, q = float32(np.int16(packed)), float32(np.int16(packed >> 16))
+        acc[x + to_i] += i
+        acc[x + to_q] += q
+        peak = max(peak, max(abs(i), abs(q)))
+    return peak
+
+
+@njit(inline="always")
+def _add_pairwise(adc, start, samples, rx, acc, to_first, to_second):  # type: ignore[no-untyped-def]
+    """Add one chirp, [rx, sample pair, (two of one part, two of the other)], to the sums [sample, rx]; returns the peak."""
+    peak = float32(0)
+    for r in range(rx):
+        for h in range(samples // 2):
+            first = adc[start + r * samples + 2 * h]
+            second = adc[start + r * samples + 2 * h + 1]
+            x = 2 * h * rx + r
+            a, b = float32(np.int16(first)), float32(np.int16(first >> 16))
+            c, d = float32(np.int16(second)), float32(np.int16(second >> 16))
+            acc[x + to_first] += a
+            acc[x + rx + to_first] += b
+            acc[x + to_second] += c
+            acc[x + rx + to_second] += d
+            peak = max(max(peak, max(abs(a), abs(b))), max(abs(c), abs(d)))
+    return peak
+
+
+@njit(inline="always")
+def _count_rails(adc, start, count):  # type: ignore[no-untyped-def]
+    """Components of ``count`` packed pairs that stand at the converter's rails."""
+    rails = 0
+    for x in range(count):
+        packed = adc[start + x]
+        rails += abs(int64(np.int16(packed))) >= RAIL
+        rails += abs(int64(np.int16(packed >> 16))) >= RAIL
+    return rails
+
+
+@njit(inline="always")
+def _window(acc, window, b, work, im):  # type: ignore[no-untyped-def]
+    """Multiply the sums by the block's complex window: taper, channel gain, range shift, scale."""
+    for x in range(im):
+        re, wr = acc[x], window[b, 0, x]
+        i, wi = acc[x + im], window[b, 1, x]
+        work[x] = re * wr - i * wi
+        work[x + im] = re * wi + i * wr
+
+
+@njit(inline="always")
+def _focus(work, focus, b, pr, pi, im):  # type: ignore[no-untyped-def]
+    """Multiply the spectrum, in memory order, by the focusing phasor, the taper and the slot's Doppler phasor."""
+    for x in range(im):
+        fr, fi = focus[b, 0, x], focus[b, 1, x]
+        cr, ci = fr * pr - fi * pi, fr * pi + fi * pr
+        re, i = work[x], work[x + im]
+        work[x] = re * cr - i * ci
+        work[x + im] = re * ci + i * cr
+
+
+@njit(inline="always")
+def _gather(work, rows, element, points, rx, im, row):  # type: ignore[no-untyped-def]
+    """Add the block's channels to their elements of the virtual row, undoing the digit reversal."""
+    for r in range(rx):
+        e = element[r]
+        if e >= 0:
+            for k in range(points):
+                x = rows[k] + r
+                row[0, e, k] += work[x]
+                row[1, e, k] += work[x + im]
+
+
+@cache
+def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Callable[..., Any]:
+    """Compile the kernel from raw samples to the virtual row's range spectra.
+
+    Args:
+        interleaved: raw chirps are [sample, rx, 2] (cascade); else [rx, sample / 2, 4] (DCA1000).
+        swapped: Q comes before I.
+        points: length of the FFT, a power of two, 64..1024; shorter chirps are zero-padded.
+        rx: receivers of one device.
+    Returns:
+        kernel(adc [values / 2], loops, loop_stride, start int64 [block], slot int64 [block], element int64 [block, rx],
+        samples, window [block, 2, points * rx], focus [block, 2, points * rx] in memory order, phasor [slot, 2],
+        twiddle, rows int64 [points], acc [2 * points * rx], work [2 * points * rx], row [2, element, points]) -> components
+        at the rails.
+        ``row`` is overwritten; ``acc`` must hold zeros beyond ``samples * rx`` of each plane.
+    """
+    im = points * rx
+    radix2 = points in (128, 512)
+    signature = int64(
+        *(RAW, int64, int64, int64[::1], int64[::1], int64[:, ::1], int64, float32[:, :, ::1], float32[:, :, ::1]),
+        *(float32[:, ::1], float32[::1], int64[::1], float32[::1], float32[::1], float32[:, :, ::1]),
+    )
+
+    @njit(signature, **OPTIONS)  # type: ignore[misc]
+    def kernel(adc, loops, loop_stride, start, slot, element, samples, window, focus,  # type: ignore[no-untyped-def]
+               phasor, twiddle, rows, acc, work, row):  # fmt: skip
+        row[:] = float32(0)
+        rails = 0
+        to_i = im if swapped else 0
+        count = samples * rx
+        for b in range(len(start)):
+            for x in range(count):
+                acc[x] = float32(0)
+                acc[x + im] = float32(0)
+            for loop in range(loops):
+                first = start[b] + loop * loop_stride
+                if interleaved:
+                    peak = _add_interleaved(adc, first, count, acc, to_i, im - to_i)
+                else:
+                    peak = _add_pairwise(adc, first, samples, rx, acc, to_i, im - to_i)
+                if peak >= RAIL:
+                    rails += _count_rails(adc, first, count)
+            _window(acc, window, b, work, im)
+            _wide_stage(work, twiddle, 0, 1, im // 4, im)
+            _wide_stage(work, twiddle, 6 * (im // 4), 4, im // 16, im)
+            _wide_stage(work, twiddle, 6 * (im // 4 + im // 16), 16, im // 64, im)
+            if points >= 256:
+                _wide_stage(work, twiddle, 6 * (im // 4 + im // 16 + im // 64), 64, im // 256, im)
+            if points >= 1024:
+                _wide_stage(work, twiddle, 6 * (im // 4 + im // 16 + im // 64 + im // 256), 256, im // 1024, im)
+            if radix2:
+                _pair_stage(work, points // 2, rx, im)
+            _focus(work, focus, b, phasor[slot[b], 0], phasor[slot[b], 1], im)
+            _gather(work, rows, element[b], points, rx, im, row)
+        return rails
+
+    return kernel  # type: ignore[no-any-return]
+
+
+@njit(inline="always")
+def _pruned_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # type: ignore[no-untyped-def]
+    """Load a chunk of the row and do the first stage; rows from ``elements`` (at most half the length) on are zero."""
+    for e in range(elements):
+        for l in range(lanes):  # noqa: E741
+            work[e * lanes + l] = row[0, e, column + l]
+            work[e * lanes + l + im] = row[1, e, column + l]
+    q = quarter * lanes
+    for p in range(quarter):
+        t = 6 * p
+        w1r, w1i, w2r = twiddle[t], twiddle[t + 1], twiddle[t + 2]
+        w2i, w3r, w3i = twiddle[t + 3], twiddle[t + 4], twiddle[t + 5]
+        if p < elements - quarter:
+            for x in range(p * lanes, (p + 1) * lanes):
+                ar, ai, br, bi = work[x], work[x + im], work[x + q], work[x + q + im]
+                work[x], work[x + im] = ar + br, ai + bi
+                yr, yi = ar - bi, ai + br
+                work[x + q], work[x + q + im] = yr * w1r - yi * w1i, yr * w1i + yi * w1r
+                yr, yi = ar - br, ai - bi
+                work[x + 2 * q], work[x + 2 * q + im] = yr * w2r - yi * w2i, yr * w2i + yi * w2r
+                yr, yi = ar + bi, ai - br
+                work[x + 3 * q], work[x + 3 * q + im] = yr * w3r - yi * w3i, yr * w3i + yi * w3r
+        else:
+            keep = float32(p < elements)
+            for x in range(p * lanes, (p + 1) * lanes):
+                yr, yi = work[x] * keep, work[x + im] * keep
+                work[x], work[x + im] = yr, yi
+                work[x + q], work[x + q + im] = yr * w1r - yi * w1i, yr * w1i + yi * w1r
+                work[x + 2 * q], work[x + 2 * q + im] = yr * w2r - yi * w2i, yr * w2i + yi * w2r
+                work[x + 3 * q], work[x + 3 * q + im] = yr * w3r - yi * w3i, yr * w3i + yi * w3r
+
+
+@cache
+def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
+    """Compile the kernel from the virtual row's range spectra to power over direction cosine and range.
+
+    Args:
+        bins: length of the angle FFT, a power of two, 64..4096, at least twice the elements.
+        points: range bins.
+        lanes: range bins per vector.
+    Returns:
+        kernel(row [2, element, points], twiddle, target int64 [bins], gain [bins], work [2 * bins * lanes],
+        power [bins, points]); row ``target[i]`` of ``power`` receives FFT row i times ``gain[target[i]]``.
+    """
+    im = bins * lanes
+    radix2 = bins in (128, 512, 2048)
+    signature = types.void(
+        float32[:, :, ::1], float32[::1], int64[::1], float32[::1], float32[::1], float32[:, ::1]
+    )  # fmt: skip
+
+    @njit(signature, **OPTIONS)  # type: ignore[misc]
+    def kernel(row, twiddle, target, gain, work, power):  # type: ignore[no-untyped-def]
+        for column in range(0, points, lanes):
+            _pruned_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
+            _narrow_stage(work, twiddle, 6 * (bins // 4), 4, bins // 16, lanes, im)
+            _narrow_stage(work, twiddle, 6 * (bins // 4 + bins // 16), 16, bins // 64, lanes, im)
+            if bins >= 256:
+                _narrow_stage(work, twiddle, 6 * (bins // 4 + bins // 16 + bins // 64), 64, bins // 256, lanes, im)
+            if bins >= 1024:
+                _narrow_stage(
+                    work, twiddle, 6 * (bins // 4 + bins // 16 + bins // 64 + bins // 256), 256, bins // 1024, lanes, im
+                )
+            if bins >= 4096:
+                _narrow_stage(work, twiddle, 2 * (bins - bins // 1024), 1024, bins // 4096, lanes, im)
+            if radix2:
+                _pair_stage(work, bins // 2, lanes, im)
+            for i in range(bins):
+                t = target[i]
+                for l in range(lanes):  # noqa: E741
+                    re, imag = work[i * lanes + l], work[i * lanes + l + im]
+                    power[t, column + l] = (re * re + imag * imag) * gain[t]
+
+    return kernel  # type: ignore[no-any-return]
