@@ -129,7 +129,7 @@ def read_manifest(objects_dir: Path) -> list[Entry]:
             try:
                 entry = Entry(
                     path=objects_dir / row["file"],
-                    label=CLASSES.index(row["class"]),  # type: ignore[arg-type]
+                    label=CLASSES.index(row["class"]),
                     name=row["name"],
                     provenance=row["provenance_grade"],
                     source_group=row["source_group"],

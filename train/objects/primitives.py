@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge.frames import Float32, Float64
-from train.objects.sampling import Int32
+from train.objects.sampling import Int32, face_areas
 
 Part = tuple[Float64, NDArray[np.int64]]
 """Vertices float64 [n, 3] in metres and faces int64 [m, 3]."""
@@ -21,11 +21,13 @@ def vec(x: float, y: float, z: float) -> Float64:
 
 
 def join(parts: Sequence[Part]) -> tuple[Float32, Int32]:
-    """One triangle soup of many parts: vertices float32 [n, 3], faces int32 [m, 3]."""
+    """One triangle soup of many parts, without faces that have no area: vertices float32 [n, 3], faces int32 [m, 3]."""
     offsets = np.cumsum([0] + [len(v) for v, _ in parts[:-1]])
     vertices = np.concatenate([v for v, _ in parts]).astype(np.float32)
     faces = np.concatenate([f + o for (_, f), o in zip(parts, offsets, strict=True)]).astype(np.int32)
-    return vertices, faces
+    areas = np.empty(len(faces))
+    face_areas(vertices, faces, areas)
+    return vertices, faces[areas > 1e-9]
 
 
 def grid(points: Float64, *, around: bool = True) -> Part:
