@@ -72,10 +72,10 @@ def dead_names(dead: NDArray[np.uint8], layout: Layout) -> tuple[str, ...]:
         For example ("RX5", "TX3", "TX1 RX2").
     """
     transmitter = [layout.slots - s if layout.kind == "cascade" else s + 1 for s in range(layout.slots)]
-    by_receiver = dead.all(axis=0)
-    by_slot = dead.all(axis=1) & (not by_receiver.all())
+    by_receiver = np.asarray(dead.all(axis=0))
+    by_slot = np.asarray(dead.all(axis=1) & (not by_receiver.all()))
     names = [f"RX{r + 1}" for r in np.flatnonzero(by_receiver)]
     names += [f"TX{transmitter[s]}" for s in np.flatnonzero(by_slot)]
-    single = dead.astype(bool) & ~by_receiver[None, :] & ~by_slot[:, None]
+    single = dead.astype(np.bool_) & ~by_receiver[None, :] & ~by_slot[:, None]
     names += [f"TX{transmitter[s]} RX{r + 1}" for s, r in np.argwhere(single)]
     return tuple(names)

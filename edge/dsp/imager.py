@@ -134,7 +134,8 @@ class Imager:
         device, rx = receiver // layout.rx, receiver % layout.rx
         first = device * layout.loops * self._loop_stride + slot * chirp + rx * (1 if interleaved else layout.samples)
         self._channel_start = np.ascontiguousarray(first, dtype=np.int64)
-        self._channel_step, self._channel_word = (layout.rx, 1) if interleaved else (2, 2)
+        self._channel_step = layout.rx if interleaved else 2
+        self._channel_word = 1 if interleaved else 2
 
     def _make_windows(self) -> None:
         """Complex windows before and focusing phasors after the range FFT, [block, (re, im), points * rx]."""
@@ -283,5 +284,5 @@ class Imager:
 
     @property
     def row(self) -> Float32:
-        """Range spectra of the virtual row [(re, im), element, range] of the last frame: calibrated, focused, tapered."""
+        """Calibrated, focused, tapered spectra [(re, im), element, range] of the last frame."""
         return self._row

@@ -45,4 +45,4 @@ def _response(taper: Float64, bins: int, weight: Float64, shift: Float64, offset
     n = n - (taper * n).sum() / taper.sum()
     away = offset[:, None] - np.sqrt(spread)[:, None] * shift[None, :]
     response = np.cos(2.0 * np.pi / bins * away[..., None] * n) @ taper
-    return np.abs(response @ weight) / (taper.sum() * weight.sum())
+    return np.asarray(np.abs(response @ weight) / (taper.sum() * weight.sum()))

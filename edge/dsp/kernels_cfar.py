@@ -13,7 +13,7 @@ from typing import Any
 
 from numba import boolean, float32, int64, njit, types
 
-OPTIONS = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 BLOCK = 32
 """Range cells that are looked at together for the rare one above the threshold."""
 
@@ -47,7 +47,7 @@ def ring_mean_kernel(guard_angle: int, train_angle: int, guard_range: int, train
     """
     matrix = float32[:, ::1]
 
-    @njit(types.void(matrix, int64, float32[::1], float32[::1], matrix, matrix, matrix), **OPTIONS)  # type: ignore[misc]
+    @njit(types.void(matrix, int64, float32[::1], float32[::1], matrix, matrix, matrix), **OPTIONS)
     def kernel(power, first, inverse_count, line, full, side, noise):  # type: ignore[no-untyped-def]
         angles, ranges = power.shape
         for a in range(angles):
@@ -65,10 +65,10 @@ def ring_mean_kernel(guard_angle: int, train_angle: int, guard_range: int, train
                     total += side[a + train_angle - guard_angle + d, r]
                 noise[a, r] = total * inverse_count[r]
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel
 
 
-@njit(types.void(float32[:, ::1], float32[:, ::1], float32[::1], int64, boolean[:, ::1]), **OPTIONS)  # type: ignore[misc]
+@njit(types.void(float32[:, ::1], float32[:, ::1], float32[::1], int64, boolean[:, ::1]), **OPTIONS)
 def mean_decisions(power, noise, factor, first, decided):  # type: ignore[no-untyped-def]
     """Decision of every cell: power > factor[range] * noise, before any local-maximum test; False below ``first``."""
     for a in range(power.shape[0]):
@@ -92,7 +92,7 @@ def _is_peak(power, a, r):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(int64(float32[:, ::1], float32[:, ::1], float32[::1], int64, int64[::1], float32[::1]), **OPTIONS)  # type: ignore[misc]
+@njit(int64(float32[:, ::1], float32[:, ::1], float32[::1], int64, int64[::1], float32[::1]), **OPTIONS)
 def mean_peaks(power, noise, factor, first, cells, estimate):  # type: ignore[no-untyped-def]
     """Local maxima above the threshold of a noise map.
 
@@ -151,11 +151,11 @@ def _exceeds_rank(power, a, r, first, ring, factor, allowed):  # type: ignore[no
     return True
 
 
-RING = types.UniTuple(int64, 4)
+RING = types.UniTuple(int64, 4)  # type: ignore[no-untyped-call]
 """Half widths guard_angle, train_angle, guard_range, train_range."""
 
 
-@njit(types.void(float32[:, ::1], int64, RING, float32[::1], int64[::1], boolean[:, ::1]), **OPTIONS)  # type: ignore[misc]
+@njit(types.void(float32[:, ::1], int64, RING, float32[::1], int64[::1], boolean[:, ::1]), **OPTIONS)
 def rank_decisions(power, first, ring, factor, allowed, decided):  # type: ignore[no-untyped-def]
     """Ordered-statistic decision of every cell: power > factor[range] x_(k), allowed[range] = N - k; exact, slow."""
     for a in range(power.shape[0]):
@@ -203,7 +203,7 @@ def _ordered_statistic(power, a, r, first, ring, allowed, scratch):  # type: ign
 @njit(
     int64(float32[:, ::1], int64, RING, float32[::1], int64[::1], float32[::1], float32[::1], int64[::1], float32[::1]),
     **OPTIONS,
-)  # type: ignore[misc]
+)
 def rank_peaks(power, first, ring, factor, allowed, peak, scratch, cells, estimate):  # type: ignore[no-untyped-def]
     """Local maxima that the ordered-statistic test accepts; exact.
 

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from numba import boolean, int32, int64, njit, types, uint8
 
 RAW = types.Array(int32, 1, "C", readonly=True)
-OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 
-@njit(boolean(RAW), **OPTIONS)  # type: ignore[misc]
+@njit(boolean(RAW), **OPTIONS)
 def all_zero(adc):  # type: ignore[no-untyped-def]
     """True when every value of ``adc`` [values / 2] is zero; stops at the first that is not."""
     for x in range(len(adc)):  # noqa: SIM110 - a kernel
@@ -18,7 +20,7 @@ def all_zero(adc):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(int64(RAW, int64[:, ::1], int64, int64, int64, uint8[:, ::1]), **OPTIONS)  # type: ignore[misc]
+@njit(int64(RAW, int64[:, ::1], int64, int64, int64, uint8[:, ::1]), **OPTIONS)
 def dead_channels(adc, start, samples, step, word, dead):  # type: ignore[no-untyped-def]
     """Mark the channels whose first chirp is constant; stops at each channel's first change.
 

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import float32, float64, int64, njit, types
 
-OPTIONS = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 LARGEST_PARABOLA = 0.5
 
 
@@ -24,7 +26,7 @@ def _sink(value, index, root, size):  # type: ignore[no-untyped-def]
         root = child
 
 
-@njit(int64(float32[:, ::1], int64[::1], int64, int64, float32[::1], int64[::1]), **OPTIONS)  # type: ignore[misc]
+@njit(int64(float32[:, ::1], int64[::1], int64, int64, float32[::1], int64[::1]), **OPTIONS)
 def strongest(power, cells, count, most, value, index):  # type: ignore[no-untyped-def]
     """Pick the strongest peaks, strongest first (heap selection, n log most).
 
@@ -87,7 +89,7 @@ FIT = float64[::1]
         *(FIT, FIT, FIT, float32[:, ::1]),
     ),
     **OPTIONS,
-)  # type: ignore[misc]
+)
 def refine(power, gain, cells, index, estimate, count, range_fit, angle_fit, axes, out):  # type: ignore[no-untyped-def]
     """Positions and powers of detected cells.
 

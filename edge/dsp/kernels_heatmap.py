@@ -15,7 +15,7 @@ import numpy as np
 from numba import float32, int32, int64, njit, types
 
 RAIL = 32767
-OPTIONS = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 RAW = types.Array(int32, 1, "C", readonly=True)
 """Raw samples, two int16 in one int32, lower address in the lower half."""
@@ -90,7 +90,7 @@ def _add_interleaved(adc, start, count, acc, to_i, to_q):  # type: ignore[no-unt
 
 @njit(inline="always")
 def _add_pairwise(adc, start, samples, rx, acc, to_first, to_second):  # type: ignore[no-untyped-def]
-    """Add one chirp, [rx, sample pair, (two of one part, two of the other)], to the sums [sample, rx]; returns the peak."""
+    """Add one chirp, [rx, sample pair, 2 of one part, 2 of the other], to the sums [sample, rx]; returns the peak."""
     peak = float32(0)
     for r in range(rx):
         for h in range(samples // 2):
@@ -113,8 +113,10 @@ def _count_rails(adc, start, count):  # type: ignore[no-untyped-def]
     rails = 0
     for x in range(count):
         packed = adc[start + x]
-        rails += abs(int64(np.int16(packed))) >= RAIL
-        rails += abs(int64(np.int16(packed >> 16))) >= RAIL
+        if abs(int64(np.int16(packed))) >= RAIL:
+            rails += 1
+        if abs(int64(np.int16(packed >> 16))) >= RAIL:
+            rails += 1
     return rails
 
 
@@ -163,8 +165,8 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
     Returns:
         kernel(adc [values / 2], loops, loop_stride, start int64 [block], slot int64 [block], element int64 [block, rx],
         samples, window [block, 2, points * rx], focus [block, 2, points * rx] in memory order, phasor [slot, 2],
-        twiddle, rows int64 [points], acc [2 * points * rx], work [2 * points * rx], row [2, element, points]) -> components
-        at the rails.
+        twiddle, rows int64 [points], acc [2 * points * rx], work [2 * points * rx], row [2, element, points])
+        -> components at the rails.
         ``row`` is overwritten; ``acc`` must hold zeros beyond ``samples * rx`` of each plane.
     """
     im = points * rx
@@ -174,7 +176,7 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
         *(float32[:, ::1], float32[::1], int64[::1], float32[::1], float32[::1], float32[:, :, ::1]),
     )
 
-    @njit(signature, **OPTIONS)  # type: ignore[misc]
+    @njit(signature, **OPTIONS)
     def kernel(adc, loops, loop_stride, start, slot, element, samples, window, focus,  # type: ignore[no-untyped-def]
                phasor, twiddle, rows, acc, work, row):  # fmt: skip
         row[:] = float32(0)
@@ -207,7 +209,7 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
             _gather(work, rows, element[b], points, rx, im, row)
         return rails
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel
 
 
 @njit(inline="always")
@@ -260,7 +262,7 @@ def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
         float32[:, :, ::1], float32[::1], int64[::1], float32[::1], float32[::1], float32[:, ::1]
     )  # fmt: skip
 
-    @njit(signature, **OPTIONS)  # type: ignore[misc]
+    @njit(signature, **OPTIONS)
     def kernel(row, twiddle, target, gain, work, power):  # type: ignore[no-untyped-def]
         for column in range(0, points, lanes):
             _pruned_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
@@ -282,4 +284,4 @@ def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
                     re, imag = work[i * lanes + l], work[i * lanes + l + im]
                     power[t, column + l] = (re * re + imag * imag) * gain[t]
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel

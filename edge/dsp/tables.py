@@ -34,7 +34,7 @@ def next_power_of_two(count: int) -> int:
 
 
 def stage_quarters(points: int) -> list[int]:
-    """Quarter length of every radix-4 stage of a decimation-in-frequency FFT; lengths 2 * 4^k end in a radix-2 stage."""
+    """Quarter length of every radix-4 stage (decimation in frequency); lengths 2 * 4^k end in a radix-2 stage."""
     quarters, length = [], points
     while length >= 4:
         quarters.append(length // 4)
@@ -48,7 +48,7 @@ def twiddles(points: int, sign: int, lanes: int) -> Float32:
     Args:
         points: FFT length.
         sign: of the exponent.
-        lanes: 0: six scalars (re, im of m = 1, 2, 3) per p; else each of the six is a plane expanded to ``lanes`` per p.
+        lanes: 0: six scalars (re, im of m = 1, 2, 3) per p; else six planes with ``lanes`` equal values per p.
     Returns:
         float32, flat, stages one after the other.
     """

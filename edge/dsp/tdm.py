@@ -58,7 +58,8 @@ def speed_phasors(radial_speed_m_s: float, transmit_time_s: Float64, wavelength_
     Returns:
         complex64 [slots].
     """
-    return np.exp(-4j * np.pi * radial_speed_m_s * transmit_time_s / wavelength_m).astype(np.complex64)
+    phase = 4.0 * np.pi * radial_speed_m_s * transmit_time_s / wavelength_m
+    return np.asarray(np.exp(-1j * phase), dtype=np.complex64)
 
 
 def doppler_phasors(doppler_bin: float, loops: int, slots: int) -> Complex64:
@@ -72,4 +73,5 @@ def doppler_phasors(doppler_bin: float, loops: int, slots: int) -> Complex64:
         complex64 [slots].
     Source: TI cascade MATLAB example; hardware research section 3.1.
     """
-    return np.exp(-2j * np.pi * doppler_bin * np.arange(slots) / (slots * loops)).astype(np.complex64)
+    phase = 2.0 * np.pi * doppler_bin * np.arange(slots) / (slots * loops)
+    return np.asarray(np.exp(-1j * phase), dtype=np.complex64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Threshold factors of the CFAR detectors from the designed false-alarm probability, on exponentially distributed power."""
+"""Threshold factors of CFAR detectors from the designed false-alarm probability, on exponential power."""
 
 from __future__ import annotations
 

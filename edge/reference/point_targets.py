@@ -70,7 +70,7 @@ def _beat_signal(radar: Radar, points_m: Float, amplitude: Complex128, displacem
     coarse, _ = _powers(next_power, -(-samples // FINE_SAMPLES))
     coarse *= first[..., None, :]
     signal = np.matmul(coarse, np.swapaxes(fine, -1, -2))
-    return signal.reshape(*signal.shape[:2], -1)[..., :samples]
+    return np.asarray(signal.reshape(*signal.shape[:2], -1)[..., :samples])
 
 
 def _powers(base: Complex128, count: int) -> tuple[Complex128, Complex128]:
