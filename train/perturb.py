@@ -299,12 +299,12 @@ def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: n
         low, high = points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
         added.append(rng.uniform(low, high, (int(settings.outlier_share * count), 3)))
     if happens[2]:  # mirrored about a ground that is not quite flat; the part that stays above z = 0 survives the clip
-        ghost = points[rng.integers(count, size=int(settings.ghost_share * count))].copy()
+        ghost = points[rng.choice(count, int(settings.ghost_share * count), replace=False)]
         ghost[:, 2] = 2 * rng.normal(0, 0.1) - ghost[:, 2]
         added.append(ghost)
     if happens[3]:
         added.append(
-            _streaks(points[rng.integers(count, size=int(settings.streak_share * count))], view, settings, rng)
+            _streaks(points[rng.choice(count, int(settings.streak_share * count), replace=False)], view, settings, rng)
         )
     return np.concatenate(added).astype(np.float32)
 

@@ -2,7 +2,7 @@
 """Any folder of OBJ, PLY, GLB, OFF or STL meshes into the library format: ``python -m train.objects.folder IN OUT``.
 
 The folder holds one subfolder a class (car, bicycle, motorcycle, pedestrian); deeper subfolders name the source group.
-ShapeNet: ``--up +y --forward -z --length car=4.5 --length bicycle=1.75 --length motorcycle=2.1``.
+ShapeNet: ``--up=+y --forward=-z --length car=4.5 --length bicycle=1.75 --length motorcycle=2.1``.
 """
 
 from __future__ import annotations
