@@ -21,6 +21,7 @@ from train.objects.mesh import Mesh
 Range = tuple[float, float]
 AZIMUTH_SECTORS = 8
 _CANDIDATES = 8000
+_REPEATED_SIGMA_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,7 @@ class PerturbSettings:
         columns, rows: size of the depth map, fitted to the object.
         path_probability, path_views, path_m: several snapshots merged along a straight path past the object (ours).
         base_points: points drawn from the snapshot.
-        specular_probability: draw them in dense clusters about points that face the radar (ours, measured on clouds of
+        specular_probability: draw them in dense clusters about points that face the radar (ours; measured on clouds of
             the real pipeline: 16..53 % of the visible surface has a point within 15 cm). specular_spots: number of
             clusters; specular_radius_m: their sigma; specular_background: share of the weight that is not clustered.
         pass_probability, pass_share: only this share of the object's width was passed (ours).
@@ -60,10 +61,10 @@ class PerturbSettings:
     path_views: tuple[int, int] = (2, 4)
     path_m: float = 3.0
     base_points: tuple[int, int] = (400, 1500)
-    specular_probability: float = 0.5
-    specular_spots: tuple[int, int] = (3, 14)
-    specular_radius_m: Range = (0.05, 0.35)
-    specular_background: Range = (0.0, 0.15)
+    specular_probability: float = 0.6
+    specular_spots: tuple[int, int] = (2, 14)
+    specular_radius_m: Range = (0.03, 0.25)
+    specular_background: Range = (0.0, 0.05)
     pass_probability: float = 0.2
     pass_share: Range = (0.4, 0.9)
     holes: bool = True
@@ -177,10 +178,10 @@ def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings
     and strength; a fraction of the weight stays spread over everything.
     """
     count = int(rng.integers(settings.specular_spots[0], settings.specular_spots[1] + 1))
-    chance = cosine.astype(np.float64) ** 8 + 0.05
+    chance = cosine.astype(np.float64) ** 8 + 0.03
     spots = rng.choice(len(points), size=count, p=chance / chance.sum())
     sigma = rng.uniform(*settings.specular_radius_m, size=count)
-    strength = rng.exponential(size=count) + 0.1
+    strength = rng.exponential(size=count) ** 2 + 0.05  # powers of spots differ by orders of magnitude
     weight = np.zeros(len(points))
     for spot, one_sigma, one_strength in zip(spots, sigma, strength, strict=True):
         away = points - points[spot]
@@ -188,14 +189,6 @@ def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings
     background = rng.uniform(*settings.specular_background)
     spread: Float64 = (1 - background) * weight / weight.sum() + background / len(points)
     return spread
-
-
-def _draw(count: int, weight: Float64, rng: np.random.Generator) -> NDArray[np.int64]:
-    """``count`` different rows, probability proportional to weight (exponential keys, Efraimidis and Spirakis 2006)."""
-    if count >= len(weight):
-        return np.arange(len(weight))
-    key = rng.standard_exponential(len(weight)) / np.maximum(weight, 1e-12)
-    return np.argpartition(key, count)[:count]
 
 
 def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
@@ -213,10 +206,10 @@ def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.rando
         points, cosine = points[inside], cosine[inside]
     count = int(rng.integers(settings.base_points[0], settings.base_points[1] + 1))
     if len(points) > 0 and rng.random() < settings.specular_probability:
-        weight = specular_weights(points, cosine, settings, rng)
-    else:
-        weight = np.ones(len(points))
-    return points[_draw(count, weight, rng)]
+        # A spot is detected again and again from frame to frame, a little beside where it was before.
+        again = rng.choice(len(points), count, p=specular_weights(points, cosine, settings, rng))
+        return points[again] + rng.normal(0, _REPEATED_SIGMA_M, (count, 3)).astype(np.float32)
+    return points[rng.choice(len(points), min(count, len(points)), replace=False)]
 
 
 def _norm(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
