@@ -55,6 +55,8 @@ class DatasetSettings:
     Args:
         objects_dir: library folder; None = parametric objects only. ``DatasetSettings.default()`` finds the folder.
         max_points, min_points: points of a partial cloud; a draw with fewer is repeated with a new view point.
+        min_spread: so is one whose standard deviation in space is less than this share of the object's diagonal: a
+            single clump says nothing about a shape.
         truth_points: points of the truth.
         perturbation, deformation: see there; deformation is applied in train only.
         box_frame: the variant with box priors: x along the object, origin at the centre of the complete shape on the
@@ -71,6 +73,7 @@ class DatasetSettings:
     objects_dir: Path | None = None
     max_points: int = 2048
     min_points: int = 64
+    min_spread: float = 0.1
     truth_points: int = 16384
     perturbation: PerturbSettings = field(default_factory=PerturbSettings)
     deformation: DeformSettings = field(default_factory=DeformSettings)
@@ -161,9 +164,10 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         mesh = self._mesh(index, rng)
         settings = self.settings
         sector = index // len(CLASSES) if self.split == "train" else index % settings.evaluation_views
+        diagonal = float(np.linalg.norm(mesh.size_m))
         for _ in range(_ATTEMPTS):
             partial = perturb(mesh, self._perturbation, rng, sector % AZIMUTH_SECTORS)
-            if len(partial) >= settings.min_points:
+            if len(partial) >= settings.min_points and _spread(partial) >= settings.min_spread * diagonal:
                 break
         else:
             raise MeshError(
@@ -203,6 +207,11 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
             entries = self._library[label, origin]
             mesh = _load(entries[rng.integers(len(entries))])
         return vary(mesh, self.settings.deformation, rng)
+
+
+def _spread(points: Float32) -> float:
+    """Standard deviation of points [n, 3] about their mean, all axes together, metres."""
+    return float(np.sqrt(points.var(axis=0).sum()))
 
 
 @cache

@@ -62,9 +62,9 @@ class PerturbSettings:
     path_m: float = 3.0
     base_points: tuple[int, int] = (400, 1500)
     specular_probability: float = 0.6
-    specular_spots: tuple[int, int] = (2, 14)
+    specular_spots: tuple[int, int] = (3, 14)
     specular_radius_m: Range = (0.03, 0.25)
-    specular_background: Range = (0.0, 0.05)
+    specular_background: Range = (0.01, 0.05)
     pass_probability: float = 0.2
     pass_share: Range = (0.4, 0.9)
     holes: bool = True
@@ -181,7 +181,7 @@ def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings
     chance = cosine.astype(np.float64) ** 8 + 0.03
     spots = rng.choice(len(points), size=count, p=chance / chance.sum())
     sigma = rng.uniform(*settings.specular_radius_m, size=count)
-    strength = rng.exponential(size=count) ** 2 + 0.05  # powers of spots differ by orders of magnitude
+    strength = rng.exponential(size=count) ** 2 + 0.1  # powers of spots differ by orders of magnitude
     weight = np.zeros(len(points))
     for spot, one_sigma, one_strength in zip(spots, sigma, strength, strict=True):
         away = points - points[spot]
