@@ -15,6 +15,7 @@ import torch
 from edge.config import require
 from edge.frames import Float32
 from train.objects.deform import DeformSettings, vary
+from train.objects.human import HumanModel
 from train.objects.library import PROCEDURAL, SPLITS, Entry, Split, default_objects_dir, read_manifest
 from train.objects.mesh import CLASSES, ClassName, Mesh, MeshError
 from train.objects.parametric import generate
@@ -53,7 +54,8 @@ class DatasetSettings:
     """What is drawn.
 
     Args:
-        objects_dir: library folder; None = parametric objects only. ``DatasetSettings.default()`` finds the folder.
+        objects_dir: library folder (with the human model in ``human_model/mh_model.npz`` if it has one); None =
+            parametric objects only. ``DatasetSettings.default()`` finds the folder.
         max_points, min_points: points of a partial cloud; a draw with fewer is repeated with a new view point.
         min_spread: so is one whose standard deviation in space is less than this share of the object's diagonal: a
             single clump says nothing about a shape.
@@ -129,6 +131,8 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
             origin: Origin = "procedural" if entry.provenance == PROCEDURAL else "collected"
             if entry.split == split:
                 self._library.setdefault((entry.label, origin), []).append(entry)
+        model = settings.objects_dir / "human_model" / "mh_model.npz" if settings.objects_dir else None
+        self._human = model if model and model.is_file() else None
         self._evaluation = [] if split == "train" else self._evaluation_objects()
 
     def _evaluation_objects(self) -> list[Entry | tuple[int, int]]:
@@ -202,7 +206,9 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
             share[2] = 1
         origin = _ORIGINS[rng.choice(3, p=share / share.sum())]
         if origin == "parametric":
-            mesh = _parametric(label, int(rng.integers(self.settings.parametric_objects)), self.split)
+            number = int(rng.integers(self.settings.parametric_objects))
+            human = self._human if CLASSES[label] == "pedestrian" and number % 5 else None
+            mesh = _person(human, number) if human else _parametric(label, number, self.split)
         else:
             entries = self._library[label, origin]
             mesh = _load(entries[rng.integers(len(entries))])
@@ -224,6 +230,12 @@ def _load(entry: Entry) -> Mesh:
 def _parametric(label: int, number: int, split: Split) -> Mesh:
     """A parametric mesh, kept in memory; the splits have seeds of their own."""
     return generate(CLASSES[label], 3 * number + SPLITS.index(split))
+
+
+@lru_cache(maxsize=2048)
+def _person(model: Path, number: int) -> Mesh:
+    """A person of the human model, kept in memory (160 kB each)."""
+    return HumanModel.load(model).person(number)
 
 
 def mean_shape(dataset: CompletionDataset, points: int) -> Float32:

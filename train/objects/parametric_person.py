@@ -100,10 +100,32 @@ def two_link(start: ArrayLike, end: ArrayLike, first: float, second: float, bend
     return a + along * axis + off * side, a + distance * axis
 
 
-def _swing(length: float, angle: float, sideways: float = 0.0) -> Float64:
-    """A hanging segment turned forward by ``angle`` (radians) about the y axis and outward by ``sideways``."""
+@dataclass(frozen=True, slots=True)
+class LegArm:
+    """Angles of one side, radians, forward and toes-up positive, from the vertical unless stated.
+
+    Args:
+        thigh, shank, upper_arm: of the segment. foot: of the sole from the ground.
+    """
+
+    thigh: float
+    shank: float
+    foot: float
+    upper_arm: float
+
+
+def gait(phase: float, amplitude: float) -> LegArm:
+    """One side of the body at a phase 0..1 of its gait cycle; amplitude 0 stands still, 1 is a full stride."""
+    thigh = gait_angle(_HIP, phase) * amplitude
+    shank = thigh - gait_angle(_KNEE, phase) * amplitude
+    foot = shank + gait_angle(_ANKLE, phase) * amplitude
+    return LegArm(thigh, shank, foot, -math.radians(20) * amplitude * math.cos(2 * math.pi * phase))
+
+
+def swing(angle: float, sideways: float = 0.0) -> Float64:
+    """Direction of a hanging segment turned forward by ``angle`` about the y axis and to the left by ``sideways``."""
     c = math.cos(angle)
-    return length * np.array([math.sin(angle), c * math.sin(sideways), -c * math.cos(sideways)])
+    return np.array([math.sin(angle), c * math.sin(sideways), -c * math.cos(sideways)])
 
 
 def flesh(body: Body, joints: dict[str, Float64], foot_pitch: tuple[float, float] = (0.0, 0.0)) -> list[Part]:
@@ -149,19 +171,16 @@ def walking(body: Body, phase: float, amplitude: float, rng: np.random.Generator
     joints = {"pelvis": np.zeros(3), "neck": np.array([0.02 * body.stature, 0, body.torso + 0.03 * body.stature])}
     pitches = []
     for side, sign, offset in (("l", 1.0, 0.0), ("r", -1.0, 0.5)):
-        at = phase + offset
-        hip_angle = gait_angle(_HIP, at) * amplitude
-        knee_angle = hip_angle - gait_angle(_KNEE, at) * amplitude
+        angles = gait(phase + offset, amplitude)
         hip = np.array([-sign * body.hip * math.sin(yaw), sign * body.hip * math.cos(yaw), 0])
-        knee = hip + _swing(body.thigh, hip_angle)
-        ankle = knee + _swing(body.shank, knee_angle)
-        arm = -math.radians(20) * amplitude * math.cos(2 * math.pi * at)
+        knee = hip + body.thigh * swing(angles.thigh)
+        ankle = knee + body.shank * swing(angles.shank)
         shoulder = np.array([1.5 * body.shoulder * sign * math.sin(yaw), sign * body.shoulder, body.torso])
-        upper = shoulder + _swing(body.upper_arm, arm, sign * splay)
-        hand = upper + _swing(body.forearm, arm + elbow, sign * splay / 2)
+        upper = shoulder + body.upper_arm * swing(angles.upper_arm, sign * splay)
+        hand = upper + body.forearm * swing(angles.upper_arm + elbow, sign * splay / 2)
         joints |= {side + "hip": hip, side + "knee": knee, side + "ankle": ankle}
         joints |= {side + "shoulder": shoulder, side + "elbow": upper, side + "hand": hand}
-        pitches.append(knee_angle + gait_angle(_ANKLE, at) * amplitude)
+        pitches.append(angles.foot)
     return flesh(body, joints, (pitches[0], pitches[1]))
 
 
