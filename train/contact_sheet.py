@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from edge.frames import Float32
 from train.dataset import CompletionDataset, DatasetSettings
+from train.depth_scan import project, rasterize
 from train.objects.mesh import CLASSES, Mesh
 from train.objects.parametric import generate
 from train.perturb import PerturbSettings
@@ -29,8 +31,6 @@ def shade(mesh: Mesh, position: tuple[float, float, float], columns: int = 320, 
     Returns:
         float32 [rows, columns], 0..1.
     """
-    from train.depth_scan import project, rasterize
-
     center = np.array([0, 0, float(mesh.size_m[2]) / 2])
     eye = center + np.asarray(position) * float(mesh.size_m.max())
     camera, _, pinhole = project(mesh.vertices, eye, center, columns, rows)
@@ -40,7 +40,7 @@ def shade(mesh: Mesh, position: tuple[float, float, float], columns: int = 320, 
     a, b, c = (camera[mesh.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    light = np.abs(normal @ np.array([0.35, 0.75, 0.55]) / 1.0)
+    light = np.abs(normal @ np.array([0.35, 0.75, 0.55]))
     picture = np.where(hit >= 0, 0.15 + 0.75 * light[hit], 1.0)
     return picture.astype(np.float32)
 
@@ -64,8 +64,8 @@ def object_sheet(meshes: Sequence[Mesh], path: Path, columns: int = 4) -> None:
     plt.close(figure)
 
 
-def _scatter(axis: object, points: Float32, color: str, size: float, axes: tuple[int, int]) -> None:
-    axis.scatter(points[:, axes[0]], points[:, axes[1]], s=size, c=color, linewidths=0)  # type: ignore[attr-defined]
+def _scatter(axis: Any, points: Float32, color: str, size: float, axes: tuple[int, int]) -> None:
+    axis.scatter(points[:, axes[0]], points[:, axes[1]], s=size, c=color, linewidths=0)
 
 
 def sample_sheet(dataset: CompletionDataset, path: Path, count: int = 16) -> None:

@@ -94,6 +94,7 @@ class DatasetSettings:
 
     def __post_init__(self) -> None:
         require(1 <= self.min_points <= self.max_points, "dataset.min_points", self.min_points, "1..max_points")
+        require(0 <= self.min_spread < 0.3, "dataset.min_spread", self.min_spread, "0..0.3")
         require(self.truth_points >= 1, "dataset.truth_points", self.truth_points, ">= 1")
         require(self.epoch_samples >= 1, "dataset.epoch_samples", self.epoch_samples, ">= 1")
         require(self.evaluation_views >= 1, "dataset.evaluation_views", self.evaluation_views, ">= 1")
@@ -175,10 +176,10 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
                 break
         else:
             raise MeshError(
-                f"{mesh.object_id}: no view gives enough points",
-                value=len(partial),
-                allowed=f">= {settings.min_points}",
-                action="lower dataset.min_points or the perturbation",
+                f"{mesh.object_id}: no view gives enough points that are spread over the object",
+                value=f"{len(partial)} points",
+                allowed=f">= {settings.min_points} points, spread >= {settings.min_spread} of the diagonal",
+                action="lower dataset.min_points, dataset.min_spread or the perturbation",
             )
         truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
         if not settings.box_frame:

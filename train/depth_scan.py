@@ -30,7 +30,7 @@ class Hits:
     cosine: Float32
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy")
 def rasterize(
     camera: Float32, faces: Int32, focal: float, center_u: float, center_v: float, depth: Float32, hit: Int32
 ) -> None:  # pragma: no cover - compiled

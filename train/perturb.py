@@ -8,7 +8,7 @@ marked "ours" below is an addition and has its own switch; ``PerturbSettings.pap
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,11 +90,17 @@ class PerturbSettings:
     max_points: int = 2048
 
     def __post_init__(self) -> None:
-        require(0 < self.distance_m[0] <= self.distance_m[1], "perturb.distance_m", self.distance_m, "0 < near <= far")
-        require(self.max_points >= 1, "perturb.max_points", self.max_points, ">= 1")
-        require(self.base_points[0] >= 1, "perturb.base_points", self.base_points, ">= 1")
-        require(self.noise_copies[0] >= 1, "perturb.noise_copies", self.noise_copies, ">= 1")
-        require(0 <= self.hole_min_keep < 1, "perturb.hole_min_keep", self.hole_min_keep, "0..1")
+        for name in (f.name for f in fields(self)):
+            value = getattr(self, name)
+            if isinstance(value, tuple):
+                require(value[0] <= value[1], f"perturb.{name}", value, "lowest <= highest")
+            elif name.endswith(("_probability", "_share", "_keep")):
+                require(0 <= value <= 1, f"perturb.{name}", value, "0..1")
+        require(self.distance_m[0] > 0, "perturb.distance_m", self.distance_m, "> 0 m")
+        for name in ("path_views", "base_points", "specular_spots", "noise_copies", "sparse_points"):
+            require(getattr(self, name)[0] >= 1, f"perturb.{name}", getattr(self, name), ">= 1")
+        for name in ("max_points", "columns", "rows"):
+            require(getattr(self, name) >= 1, f"perturb.{name}", getattr(self, name), ">= 1")
 
     @classmethod
     def paper(cls, **changes: object) -> PerturbSettings:
@@ -194,6 +200,8 @@ def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings
 def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
     """Some hundred points of the snapshot: uniform over its pixels or clustered, maybe of a part of the object only."""
     chosen = np.arange(len(hits.points))
+    if len(chosen) == 0:
+        return hits.points
     if len(chosen) > _CANDIDATES:
         chosen = rng.choice(chosen, _CANDIDATES, replace=False)
     points, cosine = hits.points[chosen], hits.cosine[chosen]
@@ -205,7 +213,7 @@ def base_sample(hits: Hits, view: View, settings: PerturbSettings, rng: np.rando
         inside = (along >= start) & (along <= start + width)
         points, cosine = points[inside], cosine[inside]
     count = int(rng.integers(settings.base_points[0], settings.base_points[1] + 1))
-    if len(points) > 0 and rng.random() < settings.specular_probability:
+    if rng.random() < settings.specular_probability:
         # A spot is detected again and again from frame to frame, a little beside where it was before.
         again = rng.choice(len(points), count, p=specular_weights(points, cosine, settings, rng))
         return points[again] + rng.normal(0, _REPEATED_SIGMA_M, (count, 3)).astype(np.float32)

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from edge.errors import ConfigError
+from train.depth_scan import scan
 from train.objects.mesh import Mesh
 from train.objects.parametric import generate
 from train.objects.sampling import sample_surface
@@ -217,8 +218,24 @@ def test_same_seed_same_cloud(car: Mesh) -> None:
     assert first.shape != other.shape or not np.array_equal(first, other)
 
 
-def test_settings_that_cannot_work_are_refused() -> None:
-    with pytest.raises(ConfigError, match="distance_m"):
-        PerturbSettings(distance_m=(5.0, 3.0))
-    with pytest.raises(ConfigError, match="max_points"):
-        PerturbSettings(max_points=0)
+def test_an_object_that_is_not_seen_gives_no_points(car: Mesh) -> None:
+    behind = Mesh(car.vertices + np.array([500, 0, 0], np.float32), car.faces, 0, "car/away")
+    hits = scan(behind.vertices, behind.faces, np.array([0.0, 0, 1]), np.array([-1.0, 0, 1]))
+    view = draw_view(car, PerturbSettings(), np.random.default_rng(0))
+    assert base_sample(hits, view, PerturbSettings(), np.random.default_rng(0)).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("distance_m", (5.0, 3.0)),
+        ("distance_m", (0.0, 3.0)),
+        ("max_points", 0),
+        ("noise_copies", (0, 3)),
+        ("specular_probability", 1.5),
+        ("hole_min_keep", -0.1),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(key: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=key):
+        PerturbSettings(**{key: value})  # type: ignore[arg-type]
