@@ -184,14 +184,6 @@ def box(center: ArrayLike, size: ArrayLike, rotation: ArrayLike | None = None) -
     return points + np.asarray(center, dtype=float), faces
 
 
-def plate(outline: ArrayLike, thickness: float) -> list[Part]:
-    """A flat body: an outline [m, 2] in x and z, extruded to +-thickness / 2 in y."""
-    shape = np.asarray(outline, dtype=float)
-    ring = np.stack([shape[:, 0], np.zeros(len(shape)), shape[:, 1]], axis=1)
-    side = np.array([0.0, thickness / 2, 0])
-    return loft(np.stack([ring - side, ring + side]))
-
-
 def mirrored(part: Part) -> Part:
     """The same on the other side (y -> -y)."""
     return part[0] * np.array([1.0, -1, 1]), part[1]
