@@ -272,7 +272,7 @@ def _scooter_body(m: Machine, stem: Float64, rng: np.random.Generator) -> list[P
     parts.append(superellipsoid((0.02, 0.12, m.rear_radius + 0.02), (0.22, 0.07, 0.10), (0.6, 0.6), steps=(12, 7)))
     parts.append(capsule((0.1, -0.15, m.rear_radius), (-0.28, -0.16, m.rear_radius + 0.08), 0.05, 0.055))
     if rng.random() < 0.35:
-        parts.append(superellipsoid((-0.30, 0, seat + 0.16), (0.2, 0.2, 0.15), (0.5, 0.5), steps=(12, 7)))
+        parts.append(superellipsoid((-0.24, 0, seat + 0.14), (0.2, 0.2, 0.15), (0.5, 0.5), steps=(12, 7)))
     if rng.random() < 0.3:
         top = stem + vec(0.0, 0, 0.42)
         foot = stem + vec(0.14, 0, 0.08)
