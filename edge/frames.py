@@ -142,11 +142,11 @@ class PointResponse:
     """What a point target looks like in a heatmap: lets a detector undo interpolation and near-field errors.
 
     Args:
-        range_fit, angle_fit: float64 [9] each, coefficients of the sub-bin corrections (edge/dsp/interpolation.py).
+        range_fit, angle_fit: float64 [10] each, coefficients of the sub-bin corrections (edge/dsp/interpolation.py).
         gain: float32 [angle], factor that compensates the antenna gain in the heatmap's power.
         range_bias_m2: the two-way path's mean curvature; a target at (r, u) appears at r + bias (1 - u^2) / r.
         cosine_bias_m: slope of the curvature along the row, which tilts the wavefront.
-        focus_inverse_m: half the inverse of the range whose curvature is compensated everywhere; negative: each its own.
+        focus_inverse_m: 1 / (2 range) whose curvature is compensated everywhere; negative: each range has its own.
     """
 
     range_fit: Float64
@@ -165,7 +165,7 @@ class Heatmap:
         radar: which radar.
         number: frame number.
         t_first_chirp_ns: instant of the first chirp of the burst.
-        power: float32 [angle, range], linear, range innermost; a view into the imager's buffer, valid until its next frame.
+        power: float32 [angle, range], linear, range innermost; the imager's buffer, valid until its next frame.
         direction_cosine: float32 [angle], uniform over one period, ascending, -1/(2 pitch) .. +1/(2 pitch).
         range_m: float32 [range], from the phase centre of the array.
         response: how a point target appears; None: unknown, detections are interpolated by plain parabolas.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import boolean, int32, int64, njit, types, uint8
 
 RAW = types.Array(int32, 1, "C", readonly=True)
@@ -41,7 +42,7 @@ def dead_channels(adc, start, samples, step, word, dead):  # type: ignore[no-unt
             constant = True
             for w in range(word):
                 value = adc[first + w]
-                if word == 2 and (value << 16) >> 16 != value >> 16:
+                if word == 2 and np.int16(value) != np.int16(value >> 16):
                     constant = False
                 n = 0
                 while constant and n < samples // word:

@@ -61,7 +61,11 @@ def strongest(power, cells, count, most, value, index):  # type: ignore[no-untyp
 def _offset(minus, centre, plus, spread, fit):  # type: ignore[no-untyped-def]
     """Sub-bin offset, within half a bin, and the factor from the centre amplitude to the peak's."""
     bend = 2.0 * centre - minus - plus
-    p = 0.0 if bend <= 0.0 else 0.5 * (plus - minus) / bend
+    if fit[9] > 0.0:
+        larger = max(plus, minus)
+        p = larger / (centre + larger) if plus > minus else -larger / (centre + larger)
+    else:
+        p = 0.0 if bend <= 0.0 else 0.5 * (plus - minus) / bend
     p = min(max(p, -LARGEST_PARABOLA), LARGEST_PARABOLA)
     p2 = p * p
     d = p + p * (1.0 - 4.0 * p2) * (fit[0] + fit[1] * p2 + spread * (fit[2] + fit[3] * p2))
@@ -99,7 +103,7 @@ def refine(power, gain, cells, index, estimate, count, range_fit, angle_fit, axe
         cells, index: peak n is cell ``cells[index[n]]``.
         estimate: noise power, by place in ``cells``.
         count: peaks.
-        range_fit, angle_fit: [9], coefficients of the axes.
+        range_fit, angle_fit: [10], coefficients of the axes.
         axes: float64 [7]: range of bin 0, range bin, cosine of row 0, cosine step, range_bias_m2, cosine_bias_m,
             focus_inverse_m.
         out: float32 [4, count or more], receives range m, direction cosine, power dB, SNR dB.

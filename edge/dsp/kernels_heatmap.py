@@ -64,6 +64,24 @@ def _narrow_stage(work, twiddle, first, groups, quarter, lanes, im):  # type: ig
 
 
 @njit(inline="always")
+def _last_stage(work, groups, lanes, im, sign):  # type: ignore[no-untyped-def]
+    """Radix-4 stage of quarter 1: no twiddles."""
+    for g in range(groups):
+        for l in range(lanes):  # noqa: E741
+            x = 4 * g * lanes + l
+            ar, ai = work[x], work[x + im]
+            br, bi = work[x + lanes], work[x + lanes + im]
+            cr, ci = work[x + 2 * lanes], work[x + 2 * lanes + im]
+            dr, di = work[x + 3 * lanes], work[x + 3 * lanes + im]
+            sr, si, tr, ti = ar + cr, ai + ci, ar - cr, ai - ci
+            ur, ui, vr, vi = br + dr, bi + di, sign * (di - bi), sign * (br - dr)
+            work[x], work[x + im] = sr + ur, si + ui
+            work[x + lanes], work[x + lanes + im] = tr + vr, ti + vi
+            work[x + 2 * lanes], work[x + 2 * lanes + im] = sr - ur, si - ui
+            work[x + 3 * lanes], work[x + 3 * lanes + im] = tr - vr, ti - vi
+
+
+@njit(inline="always")
 def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
     """Final radix-2 stage of lengths 2 * 4^k."""
     for g in range(groups):
@@ -76,22 +94,28 @@ def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _add_interleaved(adc, start, count, acc, to_i, to_q):  # type: ignore[no-untyped-def]
-    """Add one chirp of one device, [sample, rx] of packed (I, Q), to the sums; returns the largest magnitude."""
-    peak = float32(0)
-    for x in range(count):
-        packed = adc[start + x]
-        i, q = float32(np.int16(packed)), float32(np.int16(packed >> 16))
-        acc[x + to_i] += i
-        acc[x + to_q] += q
-        peak = max(peak, max(abs(i), abs(q)))
-    return peak
+def _at_rail(value):  # type: ignore[no-untyped-def]
+    """1 when a code stands at the converter's rails, else 0; a float, which vectorises."""
+    return float32(1) if abs(value) >= float32(RAIL) else float32(0)
 
 
 @njit(inline="always")
-def _add_pairwise(adc, start, samples, rx, acc, to_first, to_second):  # type: ignore[no-untyped-def]
-    """Add one chirp, [rx, sample pair, 2 of one part, 2 of the other], to the sums [sample, rx]; returns the peak."""
-    peak = float32(0)
+def _add_interleaved(adc, start, count, keep, acc, to_i, to_q):  # type: ignore[no-untyped-def]
+    """acc = keep acc + one chirp of one device, [sample, rx] of packed (I, Q); returns the codes at the rails."""
+    rails = float32(0)
+    for x in range(count):
+        packed = adc[start + x]
+        i, q = float32(np.int16(packed)), float32(np.int16(packed >> 16))
+        acc[x + to_i] = acc[x + to_i] * keep + i
+        acc[x + to_q] = acc[x + to_q] * keep + q
+        rails += _at_rail(i) + _at_rail(q)
+    return rails
+
+
+@njit(inline="always")
+def _add_pairwise(adc, start, samples, rx, keep, acc, to_first, to_second):  # type: ignore[no-untyped-def]
+    """acc = keep acc + one chirp, [rx, sample pair, 2 of one part, 2 of the other]; returns the codes at the rails."""
+    rails = float32(0)
     for r in range(rx):
         for h in range(samples // 2):
             first = adc[start + r * samples + 2 * h]
@@ -99,24 +123,11 @@ def _add_pairwise(adc, start, samples, rx, acc, to_first, to_second):  # type: i
             x = 2 * h * rx + r
             a, b = float32(np.int16(first)), float32(np.int16(first >> 16))
             c, d = float32(np.int16(second)), float32(np.int16(second >> 16))
-            acc[x + to_first] += a
-            acc[x + rx + to_first] += b
-            acc[x + to_second] += c
-            acc[x + rx + to_second] += d
-            peak = max(max(peak, max(abs(a), abs(b))), max(abs(c), abs(d)))
-    return peak
-
-
-@njit(inline="always")
-def _count_rails(adc, start, count):  # type: ignore[no-untyped-def]
-    """Components of ``count`` packed pairs that stand at the converter's rails."""
-    rails = 0
-    for x in range(count):
-        packed = adc[start + x]
-        if abs(int64(np.int16(packed))) >= RAIL:
-            rails += 1
-        if abs(int64(np.int16(packed >> 16))) >= RAIL:
-            rails += 1
+            acc[x + to_first] = acc[x + to_first] * keep + a
+            acc[x + rx + to_first] = acc[x + rx + to_first] * keep + b
+            acc[x + to_second] = acc[x + to_second] * keep + c
+            acc[x + rx + to_second] = acc[x + rx + to_second] * keep + d
+            rails += _at_rail(a) + _at_rail(b) + _at_rail(c) + _at_rail(d)
     return rails
 
 
@@ -182,29 +193,25 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
         row[:] = float32(0)
         rails = 0
         to_i = im if swapped else 0
-        count = samples * rx
         for b in range(len(start)):
-            for x in range(count):
-                acc[x] = float32(0)
-                acc[x + im] = float32(0)
             for loop in range(loops):
                 first = start[b] + loop * loop_stride
+                keep = float32(loop > 0)
                 if interleaved:
-                    peak = _add_interleaved(adc, first, count, acc, to_i, im - to_i)
+                    rails += int64(_add_interleaved(adc, first, samples * rx, keep, acc, to_i, im - to_i))
                 else:
-                    peak = _add_pairwise(adc, first, samples, rx, acc, to_i, im - to_i)
-                if peak >= RAIL:
-                    rails += _count_rails(adc, first, count)
+                    rails += int64(_add_pairwise(adc, first, samples, rx, keep, acc, to_i, im - to_i))
             _window(acc, window, b, work, im)
             _wide_stage(work, twiddle, 0, 1, im // 4, im)
-            _wide_stage(work, twiddle, 6 * (im // 4), 4, im // 16, im)
-            _wide_stage(work, twiddle, 6 * (im // 4 + im // 16), 16, im // 64, im)
-            if points >= 256:
-                _wide_stage(work, twiddle, 6 * (im // 4 + im // 16 + im // 64), 64, im // 256, im)
-            if points >= 1024:
-                _wide_stage(work, twiddle, 6 * (im // 4 + im // 16 + im // 64 + im // 256), 256, im // 1024, im)
+            _wide_stage(work, twiddle, 2 * (im - im // 4), 4, im // 16, im)
+            if points >= 128:
+                _wide_stage(work, twiddle, 2 * (im - im // 16), 16, im // 64, im)
+            if points >= 512:
+                _wide_stage(work, twiddle, 2 * (im - im // 64), 64, im // 256, im)
             if radix2:
                 _pair_stage(work, points // 2, rx, im)
+            else:
+                _last_stage(work, points // 4, rx, im, float32(-1))
             _focus(work, focus, b, phasor[slot[b], 0], phasor[slot[b], 1], im)
             _gather(work, rows, element[b], points, rx, im, row)
         return rails
@@ -266,18 +273,17 @@ def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
     def kernel(row, twiddle, target, gain, work, power):  # type: ignore[no-untyped-def]
         for column in range(0, points, lanes):
             _pruned_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
-            _narrow_stage(work, twiddle, 6 * (bins // 4), 4, bins // 16, lanes, im)
-            _narrow_stage(work, twiddle, 6 * (bins // 4 + bins // 16), 16, bins // 64, lanes, im)
-            if bins >= 256:
-                _narrow_stage(work, twiddle, 6 * (bins // 4 + bins // 16 + bins // 64), 64, bins // 256, lanes, im)
-            if bins >= 1024:
-                _narrow_stage(
-                    work, twiddle, 6 * (bins // 4 + bins // 16 + bins // 64 + bins // 256), 256, bins // 1024, lanes, im
-                )
-            if bins >= 4096:
-                _narrow_stage(work, twiddle, 2 * (bins - bins // 1024), 1024, bins // 4096, lanes, im)
+            _narrow_stage(work, twiddle, 2 * (bins - bins // 4), 4, bins // 16, lanes, im)
+            if bins >= 128:
+                _narrow_stage(work, twiddle, 2 * (bins - bins // 16), 16, bins // 64, lanes, im)
+            if bins >= 512:
+                _narrow_stage(work, twiddle, 2 * (bins - bins // 64), 64, bins // 256, lanes, im)
+            if bins >= 2048:
+                _narrow_stage(work, twiddle, 2 * (bins - bins // 256), 256, bins // 1024, lanes, im)
             if radix2:
                 _pair_stage(work, bins // 2, lanes, im)
+            else:
+                _last_stage(work, bins // 4, lanes, im, float32(1))
             for i in range(bins):
                 t = target[i]
                 for l in range(lanes):  # noqa: E741

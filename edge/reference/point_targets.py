@@ -95,24 +95,24 @@ def pack(samples: Complex128, layout: Layout) -> Int16:
     shape = (layout.loops, layout.slots, layout.devices, layout.rx, layout.samples)
     parts = np.stack((samples.real, samples.imag), axis=-1).reshape(*shape, 2)
     codes = np.clip(np.rint(parts), -32768, 32767).astype(np.int16)
+    if layout.iq_order == "QI":
+        codes = codes[..., ::-1]
     if layout.kind == "cascade":
         return np.ascontiguousarray(codes.transpose(2, 0, 1, 4, 3, 5))
     pairs = codes[:, :, 0].reshape(layout.loops, layout.slots, layout.rx, layout.samples // 2, 2, 2)
-    by_part = pairs.swapaxes(-1, -2)
-    if layout.iq_order == "QI":
-        by_part = by_part[..., ::-1, :]
-    return np.ascontiguousarray(by_part).reshape(layout.shape)
+    return np.ascontiguousarray(pairs.swapaxes(-1, -2)).reshape(layout.shape)
 
 
 def unpack(adc: Int16, layout: Layout) -> Complex128:
     """Complex samples [loops, slots, devices * rx, samples] of a capture: the inverse of ``pack``."""
+    values = adc.astype(np.float64)
     if layout.kind == "cascade":
-        parts = adc.astype(np.float64).transpose(1, 2, 0, 4, 3, 5)
-        codes = parts[..., 0] + 1j * parts[..., 1]
+        parts = values.transpose(1, 2, 0, 4, 3, 5)
     else:
-        pairs = adc.astype(np.float64).reshape(layout.loops, layout.slots, layout.rx, layout.samples // 2, 2, 2)
-        first, second = pairs[..., 0, :], pairs[..., 1, :]
-        codes = first + 1j * second if layout.iq_order == "IQ" else second + 1j * first
+        pairs = values.reshape(layout.loops, layout.slots, layout.rx, layout.samples // 2, 2, 2)
+        parts = pairs.swapaxes(-1, -2)
+    first, second = parts[..., 0], parts[..., 1]
+    codes = first + 1j * second if layout.iq_order == "IQ" else second + 1j * first
     return codes.reshape(layout.loops, layout.slots, layout.devices * layout.rx, layout.samples)
 
 

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CFAR: false-alarm rates against the design, decisions against brute force, dynamic range, invariance."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edge.config import CfarSettings
+from edge.dsp.detector import Detector
+from edge.dsp.threshold import cfar_scale, os_rank
+from edge.errors import ConfigError
+from edge.frames import Heatmap
+from edge.reference import cfar as definition
+
+RADAR = SimpleNamespace(radar="horizontal")
+
+
+def heatmap(power, first_range_m=0.0):
+    angles, ranges = power.shape
+    cosine = ((np.arange(angles) - angles // 2) / angles).astype(np.float32)
+    range_m = (first_range_m + 0.05 * np.arange(ranges)).astype(np.float32)
+    return Heatmap("horizontal", 0, 0, np.ascontiguousarray(power, dtype=np.float32), cosine, range_m)
+
+
+def settings(kind, p_fa=1e-3, **changes):
+    return dataclasses.replace(CfarSettings(kind=kind, p_fa=p_fa, min_range_m=0.0), **changes)
+
+
+class TestScale:
+    @pytest.mark.parametrize("cells", [1, 16, 120, 264])
+    @pytest.mark.parametrize("p_fa", [1e-2, 1e-4, 1e-8])
+    @pytest.mark.parametrize("kind", ["ca", "os"])
+    def test_inverts_the_probability(self, kind, cells, p_fa):
+        rank = os_rank(cells, 0.75)
+        factor = cfar_scale(kind, cells, p_fa, rank)
+        assert definition.false_alarm_probability(kind, cells, rank, factor) == pytest.approx(p_fa, rel=1e-9)
+
+    def test_known_values(self):
+        assert cfar_scale("ca", 1, 0.1) == pytest.approx(9.0)
+        assert cfar_scale("ca", 10**7, 1e-6) == pytest.approx(math.log(1e6), rel=1e-5)
+        assert cfar_scale("os", 1, 0.1, 1) == pytest.approx(9.0)
+        assert cfar_scale("os", 16, 1e-6, 12) == pytest.approx(20.9, abs=0.1), "Rohling 1983, table for N = 16, k = 12"
+
+    def test_rank_outside_the_cells_is_refused(self):
+        with pytest.raises(ConfigError, match="rank"):
+            cfar_scale("os", 16, 1e-3, 17)
+        with pytest.raises(ConfigError, match="cells"):
+            cfar_scale("ca", 0, 1e-3)
+
+
+def false_alarm_rates(kind, p_fa, maps, ranges, seed):
+    """Share of exponential cells decided, for range columns nearer to an end than the box and for all others."""
+    rng = np.random.default_rng(seed)
+    detector = Detector(RADAR, settings(kind, p_fa))
+    hits = np.zeros(ranges)
+    for _ in range(maps):
+        hits += detector.decisions(heatmap(rng.standard_exponential((256, ranges), dtype=np.float32))).sum(axis=0)
+    edge = np.minimum(np.arange(ranges), np.arange(ranges)[::-1]) < detector.settings.train_range
+    return hits[edge].sum() / (maps * 256 * edge.sum()), hits[~edge].sum() / (maps * 256 * (~edge).sum())
+
+
+@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize(("p_fa", "maps"), [(1e-2, 250), (1e-3, 2500)])
+def test_false_alarm_rate_is_the_designed_one_inside_and_at_both_ends(kind, p_fa, maps):
+    """About 10,000 events each: the standard deviation of a rate is 1 %, the limit 5 %."""
+    edge, interior = false_alarm_rates(kind, p_fa, maps, 32, 5)
+    assert edge == pytest.approx(p_fa, rel=0.05)
+    assert interior == pytest.approx(p_fa, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ca", "os"])
+def test_false_alarm_rate_at_one_in_ten_thousand(kind):
+    edge, interior = false_alarm_rates(kind, 1e-4, 25000, 32, 6)
+    assert edge == pytest.approx(1e-4, rel=0.05)
+    assert interior == pytest.approx(1e-4, rel=0.05)
+
+
+def test_false_alarm_rate_holds_where_the_angle_axis_closes():
+    rng = np.random.default_rng(8)
+    detector = Detector(RADAR, settings("ca", 1e-2))
+    hits = np.zeros(64)
+    for _ in range(400):
+        hits += detector.decisions(heatmap(rng.standard_exponential((64, 48)))).sum(axis=1)
+    rate = hits / (400 * 48)
+    assert rate[:8].mean() == pytest.approx(1e-2, rel=0.08)
+    assert rate[-8:].mean() == pytest.approx(1e-2, rel=0.08)
+
+
+@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("shape", [(2, 8, 2, 8), (0, 1, 0, 1), (1, 5, 3, 12), (3, 4, 0, 2)])
+def test_every_decision_is_that_of_brute_force(kind, shape):
+    guard_angle, train_angle, guard_range, train_range = shape
+    chosen = settings(
+        *(kind, 0.03),
+        guard_angle=guard_angle,
+        train_angle=train_angle,
+        guard_range=guard_range,
+        train_range=train_range,
+        min_range_m=0.2,
+    )
+    rng = np.random.default_rng(sum(shape))
+    power = (rng.standard_exponential((64, 70)) * 10 ** rng.uniform(0, 2, (64, 1))).astype(np.float32)
+    first = 4
+    columns = np.r_[first : first + 14, 30, 40, 56:70]
+    cells = np.array([(a, r) for a in (0, 1, 2, 20, 33, 61, 62, 63) for r in columns])
+    expected = definition.decisions(
+        power.astype(float),
+        chosen,
+        first,
+        lambda n: cfar_scale(kind, n, 0.03, os_rank(n, chosen.os_quantile)),
+        cells,
+    )
+    decided = Detector(RADAR, chosen).decisions(heatmap(power))
+    assert np.array_equal(decided[cells[:, 0], cells[:, 1]], expected)
+    assert expected.any()
+    assert not decided[:, :first].any()
+
+
+@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scaling_changes_no_decision(kind, scale):
+    power = np.random.default_rng(1).standard_exponential((256, 64)).astype(np.float32)
+    detector = Detector(RADAR, settings(kind, 1e-2))
+    plain, scaled = detector.decisions(heatmap(power)), detector.decisions(heatmap(power * np.float32(scale)))
+    assert (plain != scaled).mean() < 1e-4
+    one, other = detector.process(heatmap(power)), detector.process(heatmap(power * np.float32(scale)))
+    assert len(one) == pytest.approx(len(other), abs=1)
+
+
+def test_a_peak_of_100_db_beside_does_not_touch_the_noise_estimate():
+    power = np.random.default_rng(2).standard_exponential((256, 128)).astype(np.float32)
+    strong = power.copy()
+    strong[100, 60] = 1e10
+    detector = Detector(RADAR, settings("ca"))
+    quiet = detector.noise(heatmap(power)).copy()
+    beside = detector.noise(heatmap(strong))
+    inside = np.zeros_like(power, dtype=bool)
+    inside[92:109, 52:69] = True
+    inside[98:103, 58:63] = False
+    assert np.array_equal(beside[~inside], quiet[~inside])
+    expected = np.array(
+        [definition.ring_values(power, a, r, detector.settings, 0).mean() for a, r in ((99, 61), (103, 70))]
+    )
+    measured = np.array([beside[99, 61], beside[103, 70]])
+    np.testing.assert_allclose(measured, expected, rtol=1e-5)
+
+
+def test_ordered_statistic_forgets_strong_neighbours():
+    rng = np.random.default_rng(3)
+    power = rng.standard_exponential((64, 64)).astype(np.float32)
+    power[32, 32] = 100.0
+    power[rng.integers(25, 40, 20), 38] = 1e10
+    found = Detector(RADAR, settings("os", 1e-6)).process(heatmap(power))
+    assert (np.abs(found.range_m - 32 * 0.05) < 0.05).any()
+    averaged = Detector(RADAR, settings("ca", 1e-6)).process(heatmap(power))
+    assert not (np.abs(averaged.range_m - 32 * 0.05) < 0.05).any()
+
+
+def test_near_ranges_are_neither_tested_nor_averaged():
+    power = np.random.default_rng(4).standard_exponential((64, 64)).astype(np.float32)
+    leaking = power.copy()
+    leaking[:, :12] *= 1e6
+    chosen = settings("ca", 1e-2, min_range_m=0.6)
+    one, other = (Detector(RADAR, chosen).decisions(heatmap(p)) for p in (power, leaking))
+    assert np.array_equal(one, other)
+    assert not other[:, :12].any()
+
+
+def test_ring_wider_than_the_angle_axis_is_refused():
+    with pytest.raises(ConfigError, match="train_angle"):
+        Detector(RADAR, settings("ca", train_angle=16)).decisions(heatmap(np.ones((32, 64))))
