@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -27,11 +28,11 @@ class _Graph:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
-    def constant(self, name: str, value: NDArray[np.generic]) -> str:
+    def constant(self, name: str, value: NDArray[Any]) -> str:
         self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
         return name
 
-    def add(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
+    def add(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
@@ -93,12 +94,12 @@ def build(weights: _Weights) -> onnx.ModelProto:
 
 def _center(graph: _Graph) -> str:
     """Points in network units about the middle of their bounding box; returns that middle [1, 3], metres."""
-    graph.constant("scale", np.float32(SCALE_M))
+    graph.constant("scale", np.array(SCALE_M, np.float32))
     axis = graph.constant("rows", np.array([0], np.int64))
     graph.add("ReduceMax", ["points", axis], "high", keepdims=1)
     graph.add("ReduceMin", ["points", axis], "low", keepdims=1)
     graph.add("Add", ["high", "low"], "both_ends")
-    graph.add("Mul", ["both_ends", graph.constant("half", np.float32(0.5))], "center")
+    graph.add("Mul", ["both_ends", graph.constant("half", np.array(0.5, np.float32))], "center")
     graph.add("Sub", ["points", "center"], "centered")
     graph.add("Div", ["centered", "scale"], "unit")
     return "center"

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model card: written from measured results only, the command beside every figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from train.evaluate import FLOOR, MACRO, Scores, table
+
+_LIMITS = """## Limits
+
+- Trained and measured on simulated, geometrically perturbed clouds of 3-D meshes only: no radar recording was used.
+  Figures on real radar clouds are unknown and must be expected to be worse.
+- Four classes; anything else is forced into one of them.
+  The class probability is not calibrated.
+- Posture, wheels and mirrors come from the training shapes, not from measurement.
+- Neither speed nor motion of the object is modelled.
+- Published tables of other networks use other data and other conventions: do not compare.
+"""
+
+
+def write_card(
+    path: Path,
+    name: str,
+    scores: dict[str, Scores],
+    files: dict[str, str],
+    training: dict[str, Any],
+    commands: dict[str, str],
+) -> None:
+    """Write card.md.
+
+    Args:
+        path: file to write.
+        name: of the model.
+        scores: of ``evaluate`` on the held-out split.
+        files: precision -> predictor name in ``scores``, the default one first.
+        training: as in the manifest.
+        commands: "fit" and "export": how the weights and the figures were made.
+    """
+    shown = next(iter(files.values()))
+    rows = [(f"**{class_name}**", shown, class_name) for class_name in [*scores[shown].classes, MACRO]]
+    others = [(predictor, predictor, MACRO) for predictor in scores]
+    head = scores[shown].summary("cd_cm")
+    parts = [
+        f"# Model card: {name}",
+        "Completes a sparse, noisy, partial cloud of a road user to 16,384 points at true scale, and names its class.\n"
+        "Cascaded PointNet encoder, coarse decoder, folding with local features (the paper's shape completion).",
+        "## Training",
+        f"{training['samples']} samples in {training['seconds']} s on {training['device']}, seed {training['seed']}; "
+        f"{training['parameters']} parameters.\n{training['dataset']}.",
+        f"```\n{commands['fit']}\n```",
+        "## Held-out objects",
+        f"Mean Chamfer distance **{head.mean:.2f} cm** (macro over classes; bootstrap 95 % interval over objects "
+        f"{head.low:.2f}–{head.high:.2f}; median sample {head.median:.2f}; {head.count} samples of "
+        f"{len(set(scores[shown].objects))} objects that training never saw), file `{shown}`.\n"
+        "CD is the mean of both directions, unsquared, at true scale; EMD matches 2048 points; F-scores are shares.",
+        f"```\n{commands['export']}\n```",
+        table(scores, rows),
+        "All predictors, macro mean:",
+        table(scores, others),
+        f'The row "{FLOOR}" is what a perfect answer scores: two samplings of one surface differ.\n'
+        '"class mean shape" is told the true class; "retrieval" takes the training shape nearest to the partial input.',
+        "## Precision",
+        _precision(scores, files),
+        _LIMITS,
+    ]
+    path.write_text("<!-- SPDX-License-Identifier: Apache-2.0 -->\n\n" + "\n\n".join(parts))
+
+
+def _precision(scores: dict[str, Scores], files: dict[str, str]) -> str:
+    lines = [
+        "| file | precision | CD cm | class accuracy | rms shift against fp32 cm | median ms, one thread |",
+        "|---|---|---|---|---|---|",
+    ]
+    for precision, file in files.items():
+        one = scores[file]
+        accuracy, shift = one.summary("class_right").mean, float(np.mean(one.values["shift_cm"]))
+        lines.append(
+            f"| `{file}` | {precision} | {one.summary('cd_cm').mean:.3f} | {accuracy:.3f} | {shift:.2f} | "
+            f"{float(np.median(one.values['time_ms'])):.0f} |"
+        )
+    return "\n".join(lines)
