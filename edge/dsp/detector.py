@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge.config import CfarSettings, require
 from edge.dsp.interpolation import PARABOLA
-from edge.dsp.kernels_cfar import mean_decisions, mean_peaks, rank_decisions, rank_peaks, ring_mean_kernel
+from edge.dsp.kernels_cfar import mean_decisions, mean_peaks, rank_decisions_kernel, rank_peaks_kernel, ring_mean_kernel
 from edge.dsp.kernels_detect import refine, strongest
 from edge.dsp.threshold import cfar_scale, os_rank
 from edge.frames import Detections, Float32, Heatmap
@@ -83,6 +83,8 @@ class Detector:
         self._index = np.zeros(settings.max_detections, dtype=np.int64)
         self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
         self._ring_mean = ring_mean_kernel(*self._ring)
+        if settings.kind == "os":
+            self._rank_peaks = rank_peaks_kernel(*self._ring)
 
     def process(self, heatmap: Heatmap) -> Detections:
         """Detections of one heatmap; the columns are the caller's to keep.
@@ -115,7 +117,8 @@ class Detector:
             self._estimate(heatmap.power)
             mean_decisions(heatmap.power, self._noise, tables.factor, tables.first, decided)
         else:
-            rank_decisions(heatmap.power, tables.first, self._ring, tables.factor, tables.allowed, decided)
+            kernel = rank_decisions_kernel(*self._ring)
+            kernel(heatmap.power, tables.first, tables.factor, tables.allowed, self._padded, decided)
         return decided
 
     def noise(self, heatmap: Heatmap) -> Float32:
@@ -140,7 +143,8 @@ class Detector:
         self._noise = np.zeros((angles, ranges), dtype=np.float32)
         self._cells = np.zeros(angles * (ranges + 1) // 4 + 1, dtype=np.int64)
         self._estimates = np.zeros(len(self._cells), dtype=np.float32)
-        self._peak = np.zeros(ranges, dtype=np.float32)
+        self._padded = np.full((angles, ranges + 2 * self.settings.train_range), -1.0, dtype=np.float32)
+        self._mark = np.zeros(ranges, dtype=np.float32)
         self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
         self._unit_gain = np.ones(angles, dtype=np.float32)
         self._shape, self._first_range_m = (angles, ranges), float(range_m[0])
@@ -156,9 +160,9 @@ class Detector:
             self._estimate(power)
             found = mean_peaks(power, self._noise, tables.factor, tables.first, self._cells, self._estimates)
         else:
-            found = rank_peaks(
-                *(power, tables.first, self._ring, tables.factor, tables.allowed, self._peak, self._scratch),
-                *(self._cells, self._estimates),
+            found = self._rank_peaks(
+                *(power, tables.first, tables.factor, tables.allowed, self._padded, self._mark),
+                *(self._scratch, self._scratch.view(np.int32), self._cells, self._estimates),
             )
         return int(found)
 

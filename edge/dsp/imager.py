@@ -15,7 +15,7 @@ from edge.dsp.antenna import along_loss_db
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
 from edge.dsp.interpolation import fit_response
 from edge.dsp.kernels_checks import all_zero, dead_channels
-from edge.dsp.kernels_heatmap import angle_kernel, range_kernel
+from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, set_motion
 from edge.errors import CaptureError
 from edge.frames import Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 SHORTEST_RANGE_M = 0.05
-ANGLE_LANES = 16
+ANGLE_LANES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,19 +241,27 @@ class Imager:
             raise reject_all_zero(frame)
         loops = self.loops_for(velocity_rig_m_s)
         self._set_motion(velocity_rig_m_s, slot_phasors, loops)
+        self._report(adc, loops, self._run_range(adc, loops))
+        if self.last_report.saturated_share > self.settings.max_saturated_share:
+            raise reject_saturated(frame, self.last_report.saturated_share, self.settings.max_saturated_share)
+        self._run_angle()
+        return Heatmap(
+            *(frame.radar, frame.number, frame.t_first_chirp_ns, self._power, self.direction_cosine, self.range_m),
+            response=self._response,
+        )
+
+    def _run_range(self, adc: NDArray[np.int32], loops: int) -> int:
+        """Fill ``_row`` from the raw words; returns the codes at the rails."""
         rails = self._range_kernel(
             *(adc, loops, self._loop_stride, self._block_start, self._block_slot, self._block_element),
             *(self.layout.samples, self._window, self._focus, self._phasor, self._range_twiddle, self._rows),
             *(self._sums, self._range_work, self._row),
         )
-        self._report(adc, loops, rails)
-        if self.last_report.saturated_share > self.settings.max_saturated_share:
-            raise reject_saturated(frame, self.last_report.saturated_share, self.settings.max_saturated_share)
+        return int(rails)
+
+    def _run_angle(self) -> None:
+        """Fill ``_power`` from ``_row``."""
         self._angle_kernel(self._row, self._angle_twiddle, self._target, self._gain, self._angle_work, self._power)
-        return Heatmap(
-            *(frame.radar, frame.number, frame.t_first_chirp_ns, self._power, self.direction_cosine, self.range_m),
-            response=self._response,
-        )
 
     def _packed(self, frame: RadarFrame) -> NDArray[np.int32]:
         """The frame as int32 words; copied only when its memory is not aligned to them."""
@@ -269,9 +277,8 @@ class Imager:
         along_m_s = 0.0 if velocity is None else float(velocity[tdm.array_axis(self.radar.radar)])
         if slot_phasors is None:
             slot_phasors = tdm.speed_phasors(-forward_m_s, self._transmit_time_s, self._wavelength_m)
-        self._phasor[:, 0] = slot_phasors.real / loops
-        self._phasor[:, 1] = slot_phasors.imag / loops
-        self.direction_cosine[:] = self._direction_cosine / (1.0 + self._motion_per_m_s * along_m_s)
+        scale = 1.0 + self._motion_per_m_s * along_m_s
+        set_motion(self._phasor, self.direction_cosine, slot_phasors, float(loops), self._direction_cosine, scale)
 
     def _report(self, adc: NDArray[np.int32], loops: int, rails: int) -> None:
         layout = self.layout

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """CFAR kernels on power [angle, range], periodic in angle, cut at both ends of range.
 
+Unsigned indices spare the inner loops Numba's wrap-around of negative ones, which would keep them from vectorising.
 The ring is a box of half widths ``train`` without the box of half widths ``guard``. Ranges below ``first`` belong to no
 ring and are not tested. Sums only add: a strong cell inside the guard box never enters the arithmetic.
 """
@@ -11,19 +12,19 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from numba import boolean, float32, int64, njit, types
+from numba import boolean, float32, int32, int64, njit, types, uint64
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
-BLOCK = 32
-"""Range cells that are looked at together for the rare one above the threshold."""
 
 
 @njit(inline="always")
 def _sum_along_range(power, a, first, guard, train, line, full, side, row):  # type: ignore[no-untyped-def]
     """Box and guardless sums along range of one angle row; ``line`` has ``train`` zeros at both ends."""
     ranges = power.shape[1]
-    for r in range(first, ranges):
+    for r in range(ranges):
         line[train + r] = power[a, r]
+    for r in range(first):
+        line[train + r] = float32(0)
     for r in range(ranges):
         outer = float32(0)
         for d in range(train - guard):
@@ -106,16 +107,14 @@ def mean_peaks(power, noise, factor, first, cells, estimate):  # type: ignore[no
         Peaks found.
     """
     angles, ranges = power.shape
-    count = 0
+    count, begin = 0, uint64(first)
     for a in range(angles):
-        for start in range(first, ranges, BLOCK):
-            stop = min(start + BLOCK, ranges)
-            above = 0
-            for r in range(start, stop):
-                above += power[a, r] > factor[r] * noise[a, r]
-            if above == 0:
-                continue
-            for r in range(start, stop):
+        above = float32(0)
+        for d in range(ranges - first):
+            c = begin + uint64(d)
+            above += float32(1) if power[a, c] > factor[c] * noise[a, c] else float32(0)
+        if above > float32(0):
+            for r in range(first, ranges):
                 if power[a, r] > factor[r] * noise[a, r] and _is_peak(power, a, r):
                     cells[count] = a * ranges + r
                     estimate[count] = noise[a, r]
@@ -124,116 +123,146 @@ def mean_peaks(power, noise, factor, first, cells, estimate):  # type: ignore[no
 
 
 @njit(inline="always")
-def _at_least(power, row, start, stop, bound, factor):  # type: ignore[no-untyped-def]
-    """Cells of a row segment whose scaled power reaches ``bound``."""
-    count = 0
-    for r in range(start, stop):
-        count += power[row, r] * factor >= bound
-    return count
+def _pad(power, first, train, padded):  # type: ignore[no-untyped-def]
+    """Copy the tested ranges into ``padded`` [A, R + 2 train], whose other cells hold -1 and count nowhere."""
+    angles, ranges = power.shape
+    begin = uint64(first)
+    for a in range(angles):
+        for d in range(ranges - first):
+            padded[a, begin + uint64(train + d)] = power[a, begin + uint64(d)]
 
 
 @njit(inline="always")
-def _exceeds_rank(power, a, r, first, ring, factor, allowed):  # type: ignore[no-untyped-def]
-    """True when at most ``allowed`` ring cells x have factor x >= power[a, r], that is power > factor x_(k)."""
-    angles, ranges = power.shape
-    bound = power[a, r]
-    low, high = max(first, r - ring[3]), min(ranges, r + ring[3] + 1)
-    left, right = max(first, min(r - ring[2], ranges)), min(ranges, r + ring[2] + 1)
-    count = 0
-    for da in range(-ring[1], ring[1] + 1):
+def _exceeds_rank(padded, a, r, guard_angle, train_angle, guard, train, factor, allowed):  # type: ignore[no-untyped-def]
+    """True when at most ``allowed`` ring cells x have factor x >= the cell's power, that is power > factor x_(k)."""
+    angles = padded.shape[0]
+    bound = padded[a, r + train]
+    begin, behind = uint64(r), uint64(r + train + guard + 1)
+    count = float32(0)
+    for da in range(-train_angle, train_angle + 1):
         row = (a + da + angles) % angles
-        if abs(da) > ring[0]:
-            count += _at_least(power, row, low, high, bound, factor)
+        if abs(da) > guard_angle:
+            for d in range(2 * train + 1):
+                count += float32(1) if padded[row, begin + uint64(d)] * factor >= bound else float32(0)
         else:
-            count += _at_least(power, row, low, left, bound, factor) + _at_least(power, row, right, high, bound, factor)
+            for d in range(train - guard):
+                count += float32(1) if padded[row, begin + uint64(d)] * factor >= bound else float32(0)
+                count += float32(1) if padded[row, behind + uint64(d)] * factor >= bound else float32(0)
         if count > allowed:
             return False
     return True
 
 
-RING = types.UniTuple(int64, 4)  # type: ignore[no-untyped-call]
-"""Half widths guard_angle, train_angle, guard_range, train_range."""
-
-
-@njit(types.void(float32[:, ::1], int64, RING, float32[::1], int64[::1], boolean[:, ::1]), **OPTIONS)
-def rank_decisions(power, first, ring, factor, allowed, decided):  # type: ignore[no-untyped-def]
-    """Ordered-statistic decision of every cell: power > factor[range] x_(k), allowed[range] = N - k; exact, slow."""
-    for a in range(power.shape[0]):
-        for r in range(power.shape[1]):
-            decided[a, r] = r >= first and _exceeds_rank(power, a, r, first, ring, factor[r], allowed[r])
-
-
 @njit(inline="always")
-def _select(values, count, rank):  # type: ignore[no-untyped-def]
-    """The ``rank``-th smallest (1 = least) of the first ``count`` values, which are reordered (Hoare's selection)."""
-    low, high = 0, count - 1
+def _select(bits, count, rank):  # type: ignore[no-untyped-def]
+    """Place of the ``rank``-th smallest (1 = least) of the first ``count`` values, which are given as bit patterns.
+
+    Floats that are not negative are ordered as their patterns read as integers, and -1 stands below all; a bisection
+    with vectorised counting finds the pattern without a branch per value.
+    """
+    low, high = int32(0), int32(0x7F800000)
     while low < high:
-        pivot = values[rank - 1]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < rank - 1:
-            low = i
-        if i > rank - 1:
-            high = j
-    return values[rank - 1]
+        middle = int32(low + ((high - low) >> 1))
+        below = float32(0)
+        for n in range(count):
+            below += float32(1) if bits[n] <= middle else float32(0)
+        if below >= rank:
+            high = middle
+        else:
+            low = int32(middle + 1)
+    n = 0
+    while bits[n] != low:
+        n += 1
+    return n
 
 
 @njit(inline="always")
-def _ordered_statistic(power, a, r, first, ring, allowed, scratch):  # type: ignore[no-untyped-def]
+def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, allowed, scratch, bits):  # type: ignore[no-untyped-def]
     """x_(k) of the ring around one cell."""
-    angles, ranges = power.shape
+    angles = padded.shape[0]
     count = 0
-    for da in range(-ring[1], ring[1] + 1):
+    for da in range(-train_angle, train_angle + 1):
         row = (a + da + angles) % angles
-        for c in range(max(first, r - ring[3]), min(ranges, r + ring[3] + 1)):
-            if abs(da) > ring[0] or abs(c - r) > ring[2]:
-                scratch[count] = power[row, c]
+        for d in range(2 * train + 1):
+            if abs(da) > guard_angle or abs(d - train) > guard:
+                scratch[count] = padded[row, r + d]
                 count += 1
-    return _select(scratch, count, count - allowed)
+    return scratch[_select(bits, count, count - allowed)]
 
 
-@njit(
-    int64(float32[:, ::1], int64, RING, float32[::1], int64[::1], float32[::1], float32[::1], int64[::1], float32[::1]),
-    **OPTIONS,
-)
-def rank_peaks(power, first, ring, factor, allowed, peak, scratch, cells, estimate):  # type: ignore[no-untyped-def]
-    """Local maxima that the ordered-statistic test accepts; exact.
+@njit(inline="always")
+def _mark_peaks(power, a, mark):  # type: ignore[no-untyped-def]
+    """For every range cell of one row: 2 larger than all 8 neighbours, 1 as large as the largest, 0 smaller."""
+    angles, ranges = power.shape
+    above, below = (a + angles - 1) % angles, (a + 1) % angles
+    for r in range(1, ranges - 1):
+        left = max(max(power[above, r - 1], power[a, r - 1]), power[below, r - 1])
+        right = max(max(power[above, r + 1], power[a, r + 1]), power[below, r + 1])
+        largest = max(max(left, right), max(power[above, r], power[below, r]))
+        centre = power[a, r]
+        mark[r] = float32(2) if centre > largest else (float32(1) if centre == largest else float32(0))
+    mark[0], mark[ranges - 1] = float32(1), float32(1)
+
+
+@cache
+def rank_peaks_kernel(guard_angle: int, train_angle: int, guard_range: int, train_range: int) -> Callable[..., Any]:
+    """Compile the search for local maxima that the ordered-statistic test accepts; exact.
 
     Args:
-        power: [A, R].
-        first: first tested range cell.
-        ring: half widths.
-        factor: float32 [R].
-        allowed: int64 [R], N - k.
-        peak: float32 [R], scratch of the local-maximum test.
-        scratch: float32 [cells of the ring].
-        cells, estimate: as in ``mean_peaks``; the noise is x_(k).
+        guard_angle, train_angle, guard_range, train_range: half widths in cells.
     Returns:
-        Peaks found.
+        kernel(power [A, R], first, factor float32 [R], allowed int64 [R] = N - k, padded [A, R + 2 train_range] of -1,
+        mark float32 [R], scratch float32 [cells of the box], bits (scratch as int32), cells, estimate) -> peaks found;
+        the last two as in ``mean_peaks``, the noise is x_(k).
     """
-    angles, ranges = power.shape
-    count = 0
-    for a in range(angles):
-        above, below = (a + angles - 1) % angles, (a + 1) % angles
-        for r in range(1, ranges - 1):
-            side = max(max(power[a, r - 1], power[a, r + 1]), max(power[above, r], power[below, r]))
-            peak[r] = float32(power[a, r] >= side)
-        peak[0], peak[ranges - 1] = float32(1), float32(1)
-        for r in range(first, ranges):
-            if (
-                peak[r] != 0
-                and _is_peak(power, a, r)
-                and _exceeds_rank(power, a, r, first, ring, factor[r], allowed[r])
-            ):
-                cells[count] = a * ranges + r
-                estimate[count] = _ordered_statistic(power, a, r, first, ring, allowed[r], scratch)
-                count += 1
-    return count
+    signature = int64(
+        *(float32[:, ::1], int64, float32[::1], int64[::1], float32[:, ::1], float32[::1], float32[::1], int32[::1]),
+        *(int64[::1], float32[::1]),
+    )
+
+    @njit(signature, **OPTIONS)
+    def kernel(power, first, factor, allowed, padded, mark, scratch, bits, cells, estimate):  # type: ignore[no-untyped-def]
+        angles, ranges = power.shape
+        count = 0
+        _pad(power, first, train_range, padded)
+        for a in range(angles):
+            _mark_peaks(power, a, mark)
+            for r in range(first, ranges):
+                if mark[r] == float32(0) or (mark[r] == float32(1) and not _is_peak(power, a, r)):
+                    continue
+                if _exceeds_rank(
+                    padded, a, r, guard_angle, train_angle, guard_range, train_range, factor[r], allowed[r]
+                ):
+                    cells[count] = a * ranges + r
+                    estimate[count] = _ordered_statistic(
+                        padded, a, r, guard_angle, train_angle, guard_range, train_range, allowed[r], scratch, bits
+                    )
+                    count += 1
+        return count
+
+    return kernel
+
+
+@cache
+def rank_decisions_kernel(guard_angle: int, train_angle: int, guard_range: int, train_range: int) -> Callable[..., Any]:
+    """Compile the ordered-statistic decision of every cell, before any local-maximum test; exact, slow.
+
+    Args:
+        guard_angle, train_angle, guard_range, train_range: half widths in cells.
+    Returns:
+        kernel(power [A, R], first, factor [R], allowed [R], padded, decided bool [A, R]): power > factor x_(k).
+    """
+    signature = types.void(
+        float32[:, ::1], int64, float32[::1], int64[::1], float32[:, ::1], boolean[:, ::1]
+    )  # fmt: skip
+
+    @njit(signature, **OPTIONS)
+    def kernel(power, first, factor, allowed, padded, decided):  # type: ignore[no-untyped-def]
+        _pad(power, first, train_range, padded)
+        for a in range(power.shape[0]):
+            for r in range(first, power.shape[1]):
+                decided[a, r] = _exceeds_rank(
+                    padded, a, r, guard_angle, train_angle, guard_range, train_range, factor[r], allowed[r]
+                )
+
+    return kernel

@@ -3,6 +3,7 @@
 
 Both FFTs are radix-4 decimation in frequency, in place, vectorised across transforms: real and imaginary planes of one
 flat float32 buffer, lanes innermost, literal strides (closure constants), digit-reversed rows undone by the store.
+Unsigned indices spare the inner loops Numba's wrap-around of negative ones, which would keep them from vectorising.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import float32, int32, int64, njit, types
+from numba import complex64, float32, float64, int32, int64, njit, types, uint64
 
 RAIL = 32767
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
@@ -102,9 +103,9 @@ def _at_rail(value):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def _add_interleaved(adc, start, count, keep, acc, to_i, to_q):  # type: ignore[no-untyped-def]
     """acc = keep acc + one chirp of one device, [sample, rx] of packed (I, Q); returns the codes at the rails."""
-    rails = float32(0)
+    rails, begin = float32(0), uint64(start)
     for x in range(count):
-        packed = adc[start + x]
+        packed = adc[begin + uint64(x)]
         i, q = float32(np.int16(packed)), float32(np.int16(packed >> 16))
         acc[x + to_i] = acc[x + to_i] * keep + i
         acc[x + to_q] = acc[x + to_q] * keep + q
@@ -117,9 +118,10 @@ def _add_pairwise(adc, start, samples, rx, keep, acc, to_first, to_second):  # t
     """acc = keep acc + one chirp, [rx, sample pair, 2 of one part, 2 of the other]; returns the codes at the rails."""
     rails = float32(0)
     for r in range(rx):
+        begin = uint64(start + r * samples)
         for h in range(samples // 2):
-            first = adc[start + r * samples + 2 * h]
-            second = adc[start + r * samples + 2 * h + 1]
+            first = adc[begin + uint64(2 * h)]
+            second = adc[begin + uint64(2 * h + 1)]
             x = 2 * h * rx + r
             a, b = float32(np.int16(first)), float32(np.int16(first >> 16))
             c, d = float32(np.int16(second)), float32(np.int16(second >> 16))
@@ -159,9 +161,9 @@ def _gather(work, rows, element, points, rx, im, row):  # type: ignore[no-untype
         e = element[r]
         if e >= 0:
             for k in range(points):
-                x = rows[k] + r
+                x = uint64(rows[k] + r)
                 row[0, e, k] += work[x]
-                row[1, e, k] += work[x + im]
+                row[1, e, k] += work[x + uint64(im)]
 
 
 @cache
@@ -217,6 +219,24 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
         return rails
 
     return kernel
+
+
+@njit(types.void(float32[:, ::1], float32[::1], complex64[::1], float64, float64[::1], float64), **OPTIONS)
+def set_motion(phasor, axis, slot_phasors, loops, unmoved_axis, scale):  # type: ignore[no-untyped-def]
+    """Write the slots' phasors over the number of summed loops, and the direction axis over the motion's scale.
+
+    Args:
+        phasor: float32 [slots, 2], receives real and imaginary parts.
+        axis: float32 [angle], receives the direction cosines.
+        slot_phasors: complex64 [slots].
+        loops: loops that are summed.
+        unmoved_axis: float64 [angle].
+        scale: 1 + the motion's share.
+    """
+    for s in range(len(slot_phasors)):
+        phasor[s, 0], phasor[s, 1] = slot_phasors[s].real / loops, slot_phasors[s].imag / loops
+    for a in range(len(axis)):
+        axis[a] = unmoved_axis[a] / scale
 
 
 @njit(inline="always")

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print the time of every stage on one cascade loop frame: ``python tests/dsp/stage_times.py [frames]``, one thread."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+from dsp_radars import cascade_radar
+
+from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
+from edge.dsp.detector import Detector
+from edge.dsp.imager import Imager
+from edge.dsp.kernels_cfar import mean_peaks
+from edge.reference.point_targets import make_frame
+
+
+def main(count: int) -> None:
+    rng = np.random.default_rng(0)
+    radar = cascade_radar()
+    points = np.c_[rng.uniform(2, 12, 15), rng.uniform(-4, 4, 15), rng.uniform(-1, 1, 15)]
+    frame = make_frame(radar, points, rng.uniform(20, 200, 15), 0, 0, noise_lsb=25.0, rng=rng)
+    imager = Imager(radar, HeatmapSettings(), AntennaSettings())
+    ca, os_ = (Detector(radar, CfarSettings(kind=kind)) for kind in ("ca", "os"))
+    heatmap = imager.process(frame)
+    print(f"{len(ca.process(heatmap))} CA detections, {len(os_.process(heatmap))} OS detections")
+    adc, power, tables, rank = imager._packed(frame), heatmap.power, ca._tables, os_._tables
+    stages = {
+        "range": lambda: imager._run_range(adc, 1),
+        "angle": lambda: imager._run_angle(),
+        "imager": lambda: imager.process(frame),
+        "ring mean": lambda: ca._estimate(power),
+        "peaks": lambda: mean_peaks(power, ca._noise, tables.factor, tables.first, ca._cells, ca._estimates),
+        "detector CA": lambda: ca.process(heatmap),
+        "peaks OS": lambda: os_._rank_peaks(
+            *(power, rank.first, rank.factor, rank.allowed, os_._padded, os_._mark),
+            *(os_._scratch, os_._scratch.view(np.int32), os_._cells, os_._estimates),
+        ),
+        "detector OS": lambda: os_.process(heatmap),
+        "imager + CA": lambda: ca.process(imager.process(frame)),
+    }
+    times = {name: np.empty(count) for name in stages}
+    for n in range(count):
+        for name, stage in stages.items():
+            start = time.perf_counter()
+            stage()
+            times[name][n] = time.perf_counter() - start
+    for name, spent in times.items():
+        print(f"{name:12s} median {1e3 * np.median(spent):.3f} ms, fastest {1e3 * spent.min():.3f} ms")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 300)
