@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from edge.config import require
 from edge.frames import Float32
-from train.dataset import CompletionDataset, Sample
+from train.dataset import CLASSES, CompletionDataset, Sample
 from train.nearest import nearest_distance
 from train.objects.sampling import sample_surface
 
@@ -38,12 +39,14 @@ class Bank:
 
     Args:
         dataset: training split.
-        shapes: how many samples are kept.
+        shapes: how many samples are kept; the classes come in turn.
+    Raises:
+        ConfigError: fewer shapes than classes.
     """
 
     def __init__(self, dataset: CompletionDataset, shapes: int) -> None:
-        chosen = np.random.default_rng(dataset.seed).choice(len(dataset), min(shapes, len(dataset)), replace=False)
-        samples = [dataset[int(index)] for index in chosen]
+        require(len(CLASSES) <= shapes <= len(dataset), "bank", shapes, f"{len(CLASSES)}..{len(dataset)} shapes")
+        samples = [dataset[index] for index in range(shapes)]
         self.shapes = [sample.truth - middle(sample.partial) for sample in samples]
         self.labels = np.array([sample.label for sample in samples])
 

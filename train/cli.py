@@ -11,9 +11,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from edge.errors import ExitCode, ModelError, RfconstructError
+
+if TYPE_CHECKING:
+    from train.checkpoint import Checkpoint
+    from train.evaluate import Scores
 
 _ALLOCATOR = {
     "MALLOC_MMAP_MAX_": "0",
@@ -92,7 +96,7 @@ def _fit(options: argparse.Namespace) -> int:
     return int(ExitCode.OK)
 
 
-def _scores(options: argparse.Namespace, folder: Path, split: str) -> dict[str, Any]:
+def _scores(options: argparse.Namespace, folder: Path, split: str) -> dict[str, Scores]:
     from train.baselines import Bank
     from train.dataset import CompletionDataset, DatasetSettings
     from train.evaluate import OnnxModel, evaluate
@@ -135,7 +139,7 @@ def _export(options: argparse.Namespace) -> int:
     validation = CompletionDataset("val", DatasetSettings.default(), 0)
     gate = evaluate(models, validation, options.samples, 0)
     default = SMALL if int8_is_good(gate, FULL, SMALL) else FULL
-    inputs = [validation[index].partial for index in spread(len(validation), 24)]
+    inputs = [validation[index].partial for index in spread(len(validation), 8)]
     tolerance_m = write_golden(folder / "golden.npz", models, inputs)
     scores = _scores(options, folder, "test")
     training = _training(checkpoint, scores[default])
@@ -147,7 +151,7 @@ def _export(options: argparse.Namespace) -> int:
     return int(ExitCode.OK)
 
 
-def _training(checkpoint: Any, scores: Any) -> dict[str, Any]:
+def _training(checkpoint: Checkpoint, scores: Scores) -> dict[str, Any]:
     metrics = ("cd_cm", "accuracy_cm", "completeness_cm", "emd_cm", "f_5cm", "f_10cm", "f_1pct", "class_right")
     settings = checkpoint.settings
     return {
@@ -162,14 +166,10 @@ def _training(checkpoint: Any, scores: Any) -> dict[str, Any]:
         "settings": settings,
         "metrics": {
             "split": "test",
-            "macro": {name: asdict(scores.summary(name)) for name in metrics if _measured(scores, name)},
+            "macro": {name: asdict(scores.summary(name)) for name in metrics if scores.measured(name)},
             "by_class": {c: round(scores.summary("cd_cm", c).mean, 3) for c in scores.classes},
         },
     }
-
-
-def _measured(scores: Any, name: str) -> bool:
-    return any(value == value for value in scores.values[name])
 
 
 def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, str]:

@@ -68,10 +68,16 @@ class Scores:
         self.objects.append(sample.object_id)
         self.labels.append(sample.label)
 
+    def _rows(self, class_name: str) -> list[int]:
+        return [row for row, label in enumerate(self.labels) if class_name in (MACRO, CLASSES[label])]
+
+    def measured(self, metric: str, class_name: str = MACRO) -> bool:
+        """Whether the figure exists for the class."""
+        return any(np.isfinite(self.values[metric][row]) for row in self._rows(class_name))
+
     def summary(self, metric: str, class_name: str = MACRO) -> Summary:
         """A figure of one class or of the mean over classes; ConfigError when nothing was measured."""
-        keep = [class_name in (MACRO, CLASSES[label]) for label in self.labels]
-        rows = [row for row, kept in enumerate(keep) if kept]
+        rows = self._rows(class_name)
         values = self.values[metric]
         return summarize([values[r] for r in rows], [self.objects[r] for r in rows], [self.labels[r] for r in rows])
 
@@ -172,9 +178,10 @@ def table(scores: dict[str, Scores], rows: Sequence[tuple[str, str, str]]) -> st
     for label, predictor, class_name in rows:
         cells = []
         for metric, _ in TABLE:
-            values = scores[predictor].values[metric]
-            measured = any(np.isfinite(values))
-            mean = scores[predictor].summary(metric, class_name).mean if measured else float("nan")
-            cells.append("–" if not measured else f"{mean:.3f}" if metric.startswith("f_") else f"{mean:.2f}")
+            if not scores[predictor].measured(metric, class_name):
+                cells.append("–")
+                continue
+            mean = scores[predictor].summary(metric, class_name).mean
+            cells.append(f"{mean:.3f}" if metric.startswith("f_") else f"{mean:.2f}")
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Neighbours against a k-d tree, the auction against the exact solver, the losses against their written definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from edge.errors import ConfigError
+from edge.frames import Float32
+from train.auction import assign
+from train.losses import LossSettings, Matcher, alpha, chamfer, completion_loss, emd
+from train.nearest import nearest_distance
+from train.network import SCALE_M, Completion
+
+
+def surface(rng: np.random.Generator, points: int, size: tuple[float, float, float] = (2.2, 0.9, 0.7)) -> Float32:
+    direction = rng.normal(size=(points, 3))
+    return (direction / np.linalg.norm(direction, axis=1, keepdims=True) * size).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def matcher() -> Matcher:
+    return Matcher(1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    queries=st.integers(1, 300),
+    targets=st.integers(1, 3000),
+    far=st.sampled_from([0.0, 1.0, 100.0]),
+    flat=st.booleans(),
+)
+def test_neighbours_equal_the_k_d_tree(seed: int, queries: int, targets: int, far: float, flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    target, query = surface(rng, targets), surface(rng, queries) * np.float32(1.1) + np.float32(far)
+    if flat:
+        target[:, 2] = 0
+    expected, _ = cKDTree(target.astype(float)).query(query.astype(float))
+    np.testing.assert_allclose(nearest_distance(query, target), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_neighbours_among_equal_points() -> None:
+    target = np.ones((50, 3), np.float32)
+    np.testing.assert_allclose(nearest_distance(target * 3, target), np.full(50, np.sqrt(12)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("points", [1, 2, 64, 512])
+@pytest.mark.parametrize("shift", [0.0, 0.05, 3.0])
+def test_auction_is_within_one_percent_of_the_optimum(points: int, shift: float) -> None:
+    rng = np.random.default_rng(points)
+    first = surface(rng, points)
+    second = surface(rng, points, (2.0, 1.0, 0.6)) + np.float32(shift)
+    cost = cdist(first, second)
+    rows, columns = linear_sum_assignment(cost)
+    partner = assign(first, second, 0.01)
+    assert sorted(partner) == list(range(points))
+    assert cost[np.arange(points), partner].mean() <= 1.01 * cost[rows, columns].mean() + 1e-6
+
+
+def test_auction_finds_a_permutation_again_and_matches_a_single_point() -> None:
+    rng = np.random.default_rng(0)
+    first, order = surface(rng, 256), rng.permutation(256)
+    np.testing.assert_array_equal(order[assign(first, first[order])], np.arange(256))
+    assert len(set(assign(np.zeros_like(first), first))) == 256
+    with pytest.raises(ConfigError):
+        assign(first, first[:-1])
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_chamfer_equals_its_definition(matcher: Matcher, squared: bool) -> None:
+    rng = np.random.default_rng(1)
+    first, second = surface(rng, 200), surface(rng, 300)
+    distance = cdist(first.astype(float), second.astype(float)) ** (2 if squared else 1)
+    expected = distance.min(1).mean() + distance.min(0).mean()
+    value = chamfer(torch.tensor(first)[None], torch.tensor(second)[None], matcher, squared)
+    assert float(value) == pytest.approx(expected if squared else expected / 2, rel=1e-4)
+
+
+def test_emd_of_a_shifted_cloud_is_the_shift_at_most(matcher: Matcher) -> None:
+    first = torch.tensor(surface(np.random.default_rng(2), 128))[None]
+    shift = torch.tensor([0.01, 0.0, 0.0])
+    assert float(emd(first, first + shift, matcher, 0.01)) == pytest.approx(0.01, rel=1e-3)
+    assert float(emd(first, first + shift, matcher, 0.01, squared=True)) == pytest.approx(1e-4, rel=1e-3)
+
+
+def test_gradients_point_away_from_the_truth(matcher: Matcher) -> None:
+    truth = torch.tensor(surface(np.random.default_rng(3), 64))[None]
+    prediction = (truth * 1.001).clone().requires_grad_()
+    emd(prediction, truth, matcher, 0.01).backward()
+    assert prediction.grad is not None
+    outward = (prediction.grad * (prediction - truth)).sum(-1)
+    assert (outward > 0).all()
+    same = truth.clone().requires_grad_()
+    chamfer(same, truth, matcher).backward()
+    assert same.grad is not None
+    assert torch.isfinite(same.grad).all()
+
+
+def test_total_is_the_weighted_sum_and_the_ramp_rises(matcher: Matcher) -> None:
+    rng = np.random.default_rng(4)
+    truth = torch.tensor(np.stack([surface(rng, 600) for _ in range(2)]))
+    coarse = torch.tensor(np.stack([surface(rng, 1024) for _ in range(2)]))
+    output = Completion(coarse, truth * 1.05, torch.zeros(2, 4))
+    generator = torch.Generator().manual_seed(0)
+    terms = completion_loss(output, truth, torch.tensor([0, 3]), 0.2, LossSettings(), matcher, generator)
+    assert float(terms.label) == pytest.approx(np.log(4))
+    assert float(terms.total) == pytest.approx(float(terms.coarse + 0.5 * terms.fine + 0.02 * terms.label))
+    assert float(terms.fine) == pytest.approx(float(chamfer(truth * 1.05, truth, matcher)) / SCALE_M, rel=1e-4)
+    assert [alpha(p) for p in (0, 0.0999, 0.1, 0.3, 1)] == [0.1, 0.1, 0.5, 1.0, 1.0]

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shipped model: unaltered, and with the answers its manifest promises."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from edge.resources import shipped_dir
+from train.dataset import CLASSES
+from train.evaluate import OnnxModel
+
+FOLDER = shipped_dir("models") / "default"
+MANIFEST = json.loads((FOLDER / "manifest.json").read_text())
+
+
+@pytest.mark.parametrize("entry", MANIFEST["files"], ids=lambda entry: entry["precision"])
+def test_file_is_unaltered_and_gives_the_golden_answer(entry: dict[str, object]) -> None:
+    path = FOLDER / str(entry["file"])
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == entry["sha256"]
+    tolerance_m = MANIFEST["golden"]["tolerance_m"][path.name]
+    with np.load(FOLDER / MANIFEST["golden"]["file"]) as golden:
+        fine, coarse, probability = OnnxModel(path)(golden["points"])
+        np.testing.assert_allclose(fine[golden["fine_rows"]], golden[f"{path.name}:fine"], atol=tolerance_m)
+        np.testing.assert_allclose(coarse, golden[f"{path.name}:coarse"], atol=tolerance_m)
+        np.testing.assert_allclose(probability, golden[f"{path.name}:class_probability"], atol=0.02)
+
+
+def test_manifest_is_complete() -> None:
+    assert MANIFEST["schema"] == 1
+    assert MANIFEST["classes"] == list(CLASSES)
+    assert MANIFEST["default_file"] in {entry["file"] for entry in MANIFEST["files"]}
+    assert MANIFEST["input"]["min_points"] == 64
+    assert MANIFEST["output"] == {"coarse": 1024, "fine": 16384}
+    assert (FOLDER / MANIFEST["golden"]["file"]).stat().st_size < 100_000
+    assert (FOLDER / "model.onnx").stat().st_size <= 10_000_000
+
+
+def test_card_names_the_samples_and_the_limits() -> None:
+    card = (FOLDER / "card.md").read_text()
+    assert f"{MANIFEST['training']['samples']} samples" in card
+    assert "no radar" in card
+
+
+def test_shift_and_repetition_of_the_input() -> None:
+    model = OnnxModel(FOLDER / "model.onnx")
+    with np.load(FOLDER / "golden.npz") as golden:
+        points = golden["points"]
+    reference = model(points)[1]
+    again = model(np.concatenate([points[::-1], points[:30]]))[1]
+    np.testing.assert_allclose(again, reference, atol=1e-4)
+    shift = np.float32([2.0, -4.0, 0.5])
+    np.testing.assert_allclose(model(points + shift)[1] - shift, reference, atol=1e-3)
