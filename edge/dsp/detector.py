@@ -82,8 +82,9 @@ class Detector:
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
         self._index = np.zeros(settings.max_detections, dtype=np.int64)
         self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
-        self._ring_mean = ring_mean_kernel(*self._ring)
-        if settings.kind == "os":
+        if settings.kind == "ca":
+            self._ring_mean = ring_mean_kernel(*self._ring)
+        else:
             self._rank_peaks = rank_peaks_kernel(*self._ring)
 
     def process(self, heatmap: Heatmap) -> Detections:
@@ -124,6 +125,7 @@ class Detector:
     def noise(self, heatmap: Heatmap) -> Float32:
         """Mean of every cell's ring [angle, range], as CA-CFAR uses it; valid until the next call."""
         self._prepare(heatmap)
+        self._ring_mean = ring_mean_kernel(*self._ring)
         self._estimate(heatmap.power)
         return self._noise
 
