@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--threads", type=int, default=2)
     fit.add_argument("--workers", type=int, default=1, help="processes that prepare samples")
     fit.add_argument("--squared", action="store_true", help="the squared distances of the paper's equations")
+    fit.add_argument("--tensorboard", action="store_true", help="also write event files for TensorBoard")
     fit.set_defaults(run=_fit)
     for name, run, text in (
         ("evaluate", _evaluate, "measure a model folder on held-out objects"),
@@ -86,7 +87,7 @@ def _fit(options: argparse.Namespace) -> int:
     from train.fit import FitSettings, Trainer
     from train.losses import LossSettings
 
-    names = {"width", "steps", "batch", "seed", "device", "threads", "workers"}
+    names = {"width", "steps", "batch", "seed", "device", "threads", "workers", "tensorboard"}
     values = {field.name: getattr(options, field.name) for field in fields(FitSettings) if field.name in names}
     settings = FitSettings(budget_s=60 * options.minutes, loss=LossSettings(squared=options.squared), **values)
     data = DatasetSettings.default(truth_points=_TRAIN_TRUTH, max_points=_TRAIN_POINTS)
@@ -139,7 +140,7 @@ def _export(options: argparse.Namespace) -> int:
     validation = CompletionDataset("val", DatasetSettings.default(), 0)
     gate = evaluate(models, validation, options.samples, 0)
     default = SMALL if int8_is_good(gate, FULL, SMALL) else FULL
-    inputs = [validation[index].partial for index in spread(len(validation), 8)]
+    inputs = [validation[index].partial for index in spread(len(validation), min(8, options.samples))]
     tolerance_m = write_golden(folder / "golden.npz", models, inputs)
     scores = _scores(options, folder, "test")
     training = _training(checkpoint, scores[default])

@@ -27,7 +27,17 @@ from train.network import COARSE_POINTS, PATCH_CELLS, SCALE_M, WIDTHS, Completio
 
 CHECKPOINT = "checkpoint.pt"
 _RATE_WINDOW = 0.05
-_NOT_IN_RESULT = ("budget_s", "steps", "workers", "threads", "device", "checkpoint_s", "validate_s", "log_s")
+_NOT_IN_RESULT = (
+    "budget_s",
+    "steps",
+    "workers",
+    "threads",
+    "device",
+    "checkpoint_s",
+    "validate_s",
+    "log_s",
+    "tensorboard",
+)
 """Settings that may change when a run is continued."""
 
 
@@ -50,6 +60,7 @@ class FitSettings:
         device: "cpu", "cuda" or "cuda:0".
         checkpoint_s, validate_s, log_s: intervals of training time.
         validation_samples: samples of the validation split, evenly spread over it.
+        tensorboard: also write event files into the run folder.
         loss: see there.
     Raises:
         ConfigError: a number outside its range.
@@ -74,6 +85,7 @@ class FitSettings:
     validate_s: float = 600.0
     log_s: float = 20.0
     validation_samples: int = 96
+    tensorboard: bool = False
     loss: LossSettings = field(default_factory=LossSettings)
 
     def __post_init__(self) -> None:
@@ -133,6 +145,7 @@ class Trainer:
         if self.state.optimizer:
             self.optimizer.load_state_dict(self.state.optimizer)
         self.matcher = Matcher(settings.threads)
+        self.board = self._board() if settings.tensorboard else None
 
     def _start(self, network: CompletionNetwork) -> Checkpoint:
         network.start_from(mean_shape(self.train, COARSE_POINTS))
@@ -143,9 +156,14 @@ class Trainer:
     def _check_settings(self) -> None:
         now = asdict(self.settings)
         for name, value in self.state.settings.items():
-            if name not in _NOT_IN_RESULT and value != now[name]:
+            if name in now and name not in _NOT_IN_RESULT and value != now[name]:
                 raise ConfigError(f"the run was started with another fit.{name}", value=now[name], allowed=str(value))
         self.state.settings = now
+
+    def _board(self) -> Any:
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(str(self.folder / "tensorboard"))
 
     @property
     def progress(self) -> float:
@@ -259,6 +277,9 @@ class Trainer:
 
     def _write(self, kind: str, values: dict[str, float]) -> None:
         record: dict[str, Any] = {"kind": kind, "step": self.state.step, "elapsed_s": self.state.elapsed_s} | values
+        if self.board:
+            for name, value in values.items():
+                self.board.add_scalar(f"{kind}/{name}", value, self.state.samples)
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / "log.jsonl").open("a") as file:
             file.write(json.dumps(record) + "\n")

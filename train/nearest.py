@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge.frames import Float32, Float64
 
-_SHELLS = 3
+_SHELLS = 5
 _BLOCK = 256
 
 
@@ -19,7 +19,7 @@ def nearest(query: Float32, target: Float32, index: NDArray[np.int32]) -> None:
 
     Cells are visited in growing shells around the query's own cell. A point outside shell r is at least r cells away
     from the query's projection onto the grid's box, and the box is convex, so the search ends exactly when
-    best^2 <= (r cell)^2 + |query - projection|^2. A query that needs more than three shells is compared with all.
+    best^2 <= (r cell)^2 + |query - projection|^2. A query that needs more than five shells is compared with all.
 
     Args:
         query: [q, 3], C-contiguous, finite.

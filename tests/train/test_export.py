@@ -105,7 +105,7 @@ def test_export_command_writes_a_whole_folder(
 ) -> None:
     monkeypatch.setenv("RFCONSTRUCT_DATA", str(tmp_path))
     target = tmp_path / "default"
-    arguments = ["export", str(checkpoint), str(target), "--samples", "4", "--emd-samples", "1", "--bank", "4"]
+    arguments = ["export", str(checkpoint), str(target), "--samples", "4", "--emd-samples", "1", "--bank", "0"]
     assert main(arguments) == 0
     manifest = json.loads((target / "manifest.json").read_text())
     for entry in manifest["files"]:
