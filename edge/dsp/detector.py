@@ -77,7 +77,7 @@ class Detector:
         """Detections of the last frame that were left out beyond ``max_detections``."""
         self._ring = (settings.guard_angle, settings.train_angle, settings.guard_range, settings.train_range)
         self._shape = (0, 0)
-        self._first_range_m = np.nan
+        self._ends_m = (np.nan, np.nan)
         self._axes = np.zeros(7)
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
         self._index = np.zeros(settings.max_detections, dtype=np.int64)
@@ -132,7 +132,8 @@ class Detector:
     def _prepare(self, heatmap: Heatmap) -> None:
         """Buffers and tables, made again only when the axes change."""
         range_m = heatmap.range_m
-        if heatmap.power.shape == self._shape and float(range_m[0]) == self._first_range_m:
+        ends_m = (float(range_m[0]), float(range_m[-1]))
+        if heatmap.power.shape == self._shape and ends_m == self._ends_m:
             return
         angles, ranges = heatmap.power.shape
         train = self.settings.train_angle
@@ -149,7 +150,7 @@ class Detector:
         self._mark = np.zeros(ranges, dtype=np.float32)
         self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
         self._unit_gain = np.ones(angles, dtype=np.float32)
-        self._shape, self._first_range_m = (angles, ranges), float(range_m[0])
+        self._shape, self._ends_m = (angles, ranges), ends_m
 
     def _estimate(self, power: Float32) -> None:
         tables = self._tables

@@ -64,7 +64,7 @@ class RowGeometry:
 
     def channel_weight(self, taper: Float64) -> Float64:
         """Weight of every channel [slots, receivers]: the element's taper shared by its channels; 0 outside the row."""
-        per_element = taper / self.multiplicity
+        per_element = taper / np.maximum(self.multiplicity, 1)
         return np.where(self.element >= 0, per_element[self.element], 0.0)
 
 
@@ -73,9 +73,11 @@ class Imager:
 
     Power is LSB^2 per complex sample: a point target of amplitude a LSB in the middle of a cell gives a^2, divided by
     the two-way antenna gain along the array. Elements of the virtual row that are missing are zeros; doubled ones are
-    averaged. Motion of the rig: its boresight part is undone per slot (exact at boresight); its part along the array
-    scales the direction cosine by 1 + 2 v sum(w p t) / sum(w p^2), least squares over the row, which is undone in the
-    heatmap's axis, while its remainder (0.02 rad rms per element at 1 m/s and 45 degrees) stays.
+    averaged. Motion of the rig: its boresight part is undone per slot (exact at boresight). Its part along the array is
+    a phase 4 pi v u t / lambda that differs from angle to angle and so cannot be undone before one FFT: its least-squares
+    scale of the direction cosine, 1 + 2 v sum(w p t) / sum(w p^2), is undone in the heatmap's axis; the remainder stays,
+    0.28 rad rms per element at 1 m/s and 45 degrees, and raises a target's sidelobes at 35 degrees from -29 dB (0 m/s)
+    to -26 (0.5), -19 (1), -15 (1.5) and -7 dB (3 m/s) with Hann windows, without moving its peak by 0.1 bin.
 
     Args:
         radar: board, mounting, schedule, calibration.
@@ -226,12 +228,12 @@ class Imager:
             slot_phasors: complex64 [slots] that replace the boresight compensation, for example those of a Doppler bin
                 (``tdm.doppler_phasors``).
         Raises:
-            CaptureError: another layout than the schedule's.
+            CaptureError: another radar's frame, or another layout than the schedule's.
             FrameRejected: all samples zero, or too many at the rails.
         """
-        if frame.layout != self.layout:
+        if frame.radar != self.radar.radar or frame.layout != self.layout:
             raise CaptureError(
-                f"{frame.radar} frame {frame.number} has another layout than the rig's schedule",
+                f"{frame.radar} frame {frame.number} has another layout than the {self.radar.radar} radar's schedule",
                 value=frame.layout,
                 allowed=str(self.layout),
                 action="use the rig that the capture was made with",

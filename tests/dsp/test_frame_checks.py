@@ -120,3 +120,9 @@ def test_only_summed_loops_count():
     imager = Imager(imager.radar, HeatmapSettings(loops=2), AntennaSettings())
     imager.process(dataclasses.replace(frame, adc=adc))
     assert (imager.last_report.loops, imager.last_report.saturated_share) == (2, 0.0)
+
+
+def test_the_other_radars_frame_is_refused():
+    imager, frame = imager_and_frame(cascade_radar)
+    with pytest.raises(CaptureError, match="vertical frame 9"):
+        imager.process(dataclasses.replace(frame, radar="vertical"))
