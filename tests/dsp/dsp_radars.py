@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from types import SimpleNamespace
 from typing import Any
 
@@ -64,6 +65,22 @@ def single_chip_radar(samples: int = 256, loops: int = 1, iq_order: str = "QI", 
     array = _array([0, 4, 2], [0, 0, 1], [0, 1, 2, 3], 77e9)
     layout = Layout("dca1000", 1, loops, 3, samples, 4, iq_order)  # type: ignore[arg-type]
     return _radar("horizontal", layout, array, Mounting(**mounting), 60e12, 6e6, 77e9)
+
+
+def calibrated(radar: Any, **changes: Any) -> Any:
+    """The radar with another gain, range_shift_bins or reference_range_m."""
+    turned = copy.copy(radar)
+    turned.calibration = copy.copy(radar.calibration)
+    vars(turned.calibration).update(changes)
+    return turned
+
+
+def relaid(radar: Any, layout: Layout) -> Any:
+    """The radar with another layout."""
+    turned = copy.copy(radar)
+    turned.schedule = copy.copy(radar.schedule)
+    turned.schedule.layout = layout
+    return turned
 
 
 def place(range_m: float, angle_deg: float, radar: str = "horizontal") -> list[float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dsp_radars import calibrated as with_calibration
 from dsp_radars import cascade_radar
 from scipy.io import loadmat
 
@@ -47,10 +48,12 @@ def calibrated(folder, frame):
     result = loadmat(folder / "calibration.mat", squeeze_me=True, struct_as_record=False)["calibResult"]
     bins, peak = np.asarray(result.RangeMat, dtype=float), np.asarray(result.PeakValMat)
     bins[np.abs(bins - np.median(bins)) > 10] = np.median(bins)
-    radar = cascade_radar(loops=LOOPS, array_sign=-1)
-    radar.calibration.range_shift_bins = ((bins - bins[11, 0]) / 5)[::-1]
-    radar.calibration.gain = np.exp(1j * np.angle(peak[11, 0] / peak))[::-1].astype(np.complex64)
-    radar.calibration.reference_range_m = REFLECTOR_M
+    radar = with_calibration(
+        cascade_radar(loops=LOOPS, array_sign=-1),
+        gain=np.exp(1j * np.angle(peak[11, 0] / peak))[::-1].astype(np.complex64),
+        range_shift_bins=((bins - bins[11, 0]) / 5)[::-1],
+        reference_range_m=REFLECTOR_M,
+    )
     return radar, heatmap_of(radar, frame)
 
 

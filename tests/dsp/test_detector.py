@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dsp_radars import cascade_radar, place
+from dsp_radars import calibrated, cascade_radar, place
 from test_cfar import RADAR, heatmap
 
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
@@ -92,11 +92,10 @@ def test_near_field_tilt_is_corrected_whatever_is_focused(focus, reference_m):
     """With a calibration that bakes a wavefront in, or without focusing, positions stay true."""
     radar = cascade_radar()
     tx_m, rx_m = radar.array.element_offsets_m()
-    radar.calibration.reference_range_m = reference_m
     if np.isfinite(reference_m):
         path_m = np.hypot(reference_m, tx_m)[:, None] + np.hypot(reference_m, rx_m) - 2 * reference_m
         phase = -2j * np.pi * path_m / radar.schedule.profile.wavelength_m
-        radar.calibration.gain = np.exp(phase).astype(np.complex64)
+        radar = calibrated(radar, gain=np.exp(phase).astype(np.complex64), reference_range_m=reference_m)
     imager, detector = Imager(radar, HeatmapSettings(focus=focus), FLAT), Detector(radar, CfarSettings())
     for range_m, angle_deg in ((4.0, 0), (4.0, 35), (9.0, -40)):
         frame = make_frame(radar, [place(range_m, angle_deg)], 1e3, 0, 0)

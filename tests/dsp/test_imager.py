@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from dsp_radars import cascade_radar, place, single_chip_radar
+from dsp_radars import calibrated, cascade_radar, place, relaid, single_chip_radar
 
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp.detector import Detector
@@ -117,9 +117,9 @@ def noisy_scene(radar, seed):
 def test_kernel_agrees_with_the_definition(window, focus):
     rng = np.random.default_rng(7)
     radar = cascade_radar("vertical", loops=3, array_sign=-1, range_offset_m=0.1)
-    radar.calibration.gain = (rng.uniform(0.5, 2, (12, 16)) * np.exp(2j * np.pi * rng.random((12, 16)))).astype("c8")
-    radar.calibration.range_shift_bins = rng.uniform(-1, 1, (12, 16))
-    radar.calibration.reference_range_m = 5.0
+    gain = (rng.uniform(0.5, 2, (12, 16)) * np.exp(2j * np.pi * rng.random((12, 16)))).astype(np.complex64)
+    shift_bins = rng.uniform(-1, 1, (12, 16))
+    radar = calibrated(radar, gain=gain, range_shift_bins=shift_bins, reference_range_m=5.0)
     settings = HeatmapSettings(range_window=window, angle_window=window, focus=focus)
     frame = noisy_scene(radar, 1)
     imager = Imager(radar, settings, AntennaSettings())
@@ -273,8 +273,7 @@ def test_calibration_undoes_random_gains_and_delays():
     clean = Imager(radar, HeatmapSettings(), FLAT).process(make_frame(radar, points, 1e3, 0, 0)).power.copy()
     frame = make_frame(radar, points, 1e3, 0, 0, channel_gain=gain, shift_bins=shift)
     spoiled = Imager(radar, HeatmapSettings(), FLAT).process(frame).power.copy()
-    radar.calibration.gain = (1 / gain).astype(np.complex64)
-    radar.calibration.range_shift_bins = shift
+    radar = calibrated(radar, gain=(1 / gain).astype(np.complex64), range_shift_bins=shift)
     restored = Imager(radar, HeatmapSettings(), FLAT).process(frame).power
     assert np.abs(restored - clean).max() < 2e-3 * clean.max()
     assert spoiled.max() < 0.1 * clean.max()
@@ -287,6 +286,5 @@ def test_swapped_i_and_q_put_the_target_on_the_image_side(make):
     swapped = dataclasses.replace(layout, iq_order="IQ" if layout.iq_order == "QI" else "QI")
     frame = make_frame(radar, [place(4.0, 0)], 500.0, 0, 0)
     right = Imager(radar, settings, FLAT).process(frame).power.max(axis=0).argmax()
-    radar.schedule.layout = swapped
-    wrong = Imager(radar, settings, FLAT).process(dataclasses.replace(frame, layout=swapped))
+    wrong = Imager(relaid(radar, swapped), settings, FLAT).process(dataclasses.replace(frame, layout=swapped))
     assert (right + wrong.power.max(axis=0).argmax()) % len(wrong.range_m) == pytest.approx(0, abs=1)
