@@ -75,7 +75,7 @@ class Imager:
     the two-way antenna gain along the array. Elements of the virtual row that are missing are zeros; doubled ones are
     averaged. Motion of the rig: its boresight part is undone per slot (exact at boresight). Its part along the array is
     a phase 4 pi v u t / lambda that differs from angle to angle and cannot be undone before one FFT: its least-squares
-    scale of the direction cosine, 1 + 2 v sum(w p t) / sum(w p^2), is undone in the heatmap's axis. The remainder stays,
+    scale of the direction cosine, 1 + 2 v sum(w p t) / sum(w p^2), is undone in the heatmap's axis. The rest stays,
     0.28 rad rms per element at 1 m/s and 45 degrees; it raises a target's sidelobes at 35 degrees from -29 dB (0 m/s)
     to -26 (0.5), -19 (1), -15 (1.5) and -7 dB (3 m/s) with Hann windows, without moving its peak by 0.1 bin.
 
