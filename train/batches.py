@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -68,8 +69,11 @@ class Order(Sampler[list[int]]):
             yield order[number * self.batch : (number + 1) * self.batch].tolist()
 
 
-def _one_thread(_: int) -> None:
+def _start_worker(_: int) -> None:
+    """One thread; the trainer alone decides what an interrupt means, and may end the worker."""
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def endless(dataset: CompletionDataset, batch: int, seed: int, step: int, workers: int) -> Iterator[Batch]:
@@ -88,7 +92,7 @@ def endless(dataset: CompletionDataset, batch: int, seed: int, step: int, worker
         batch_sampler=order,
         num_workers=workers,
         collate_fn=collate,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_start_worker,
         persistent_workers=workers > 0,
         prefetch_factor=4 if workers else None,
     )
