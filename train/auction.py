@@ -78,9 +78,10 @@ def assign(first: Float32, second: Float32, tolerance: float = 0.01) -> NDArray[
     Returns:
         int32 [n], a permutation.
     Raises:
-        ConfigError: different sizes or a tolerance outside 0..1.
+        ConfigError: different sizes, values that are not finite, or a tolerance outside 0..1.
     """
     require(first.shape == second.shape and len(first) >= 1, "point sets", second.shape, f"{first.shape}")
+    require(bool(np.isfinite(first).all() and np.isfinite(second).all()), "point sets", "NaN or infinity", "finite")
     require(0 < tolerance < 1, "tolerance", tolerance, "0..1")
     assignment = np.empty(len(first), np.int32)
     auction(_distances(np.ascontiguousarray(first), np.ascontiguousarray(second)), tolerance, assignment)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import signal
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from edge.config import require
-from edge.errors import ConfigError
+from edge.errors import ConfigError, ModelError
 from train.batches import Batch, collate, endless
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.dataset import CLASSES, CompletionDataset, mean_shape
@@ -151,10 +152,25 @@ class Trainer:
         network.start_from(mean_shape(self.train, COARSE_POINTS))
         weights = {name: value.clone() for name, value in network.state_dict().items()}
         average = {name: value.clone() for name, value in weights.items()}
-        return Checkpoint(weights, average, {}, 0, 0, 0.0, asdict(self.settings), [])
+        return Checkpoint(weights, average, {}, 0, 0, 0.0, self._description(), [])
+
+    def _description(self) -> dict[str, Any]:
+        """Settings, and what the data were drawn from."""
+        data = self.train.settings
+        names = "\n".join(sorted(self.train.object_ids))
+        return asdict(self.settings) | {
+            "data": {
+                "library_objects": len(self.train.object_ids),
+                "library_sha256": hashlib.sha256(names.encode()).hexdigest(),
+                "seed": self.train.seed,
+                "truth_points": data.truth_points,
+                "max_points": data.max_points,
+                "box_frame": data.box_frame,
+            }
+        }
 
     def _check_settings(self) -> None:
-        now = asdict(self.settings)
+        now = self._description()
         for name, value in self.state.settings.items():
             if name in now and name not in _NOT_IN_RESULT and value != now[name]:
                 raise ConfigError(f"the run was started with another fit.{name}", value=now[name], allowed=str(value))
@@ -213,10 +229,12 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(progress, settings)
         output = self.network(batch.points_m, batch.counts, cells)
+        self._check_finite(output.fine)
         terms = completion_loss(output, batch.truth_m, batch.labels, progress, settings.loss, self.matcher, generator)
         self.optimizer.zero_grad(set_to_none=True)
         terms.total.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip, error_if_nonfinite=True)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip)
+        self._check_finite(norm)
         self.optimizer.step()
         decay = min(settings.average, (1 + state.step) / (10 + state.step))
         with torch.no_grad():
@@ -225,6 +243,13 @@ class Trainer:
         state.step += 1
         state.samples += len(batch.counts)
         return terms
+
+    def _check_finite(self, value: torch.Tensor) -> None:
+        if not torch.isfinite(value).all():
+            raise ModelError(
+                f"training diverged at step {self.state.step}: output or gradient is not finite",
+                action="start again with a lower rate; the last checkpoint is as it was",
+            )
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:

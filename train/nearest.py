@@ -7,6 +7,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.config import require
 from edge.frames import Float32, Float64
 
 _SHELLS = 5
@@ -129,7 +130,13 @@ def _far(x: float, y: float, z: float, columns: Float32) -> int:
 
 
 def nearest_index(query: Float32, target: Float32) -> NDArray[np.int32]:
-    """Index of the nearest target point of every query point: int32 [q] (see ``nearest``)."""
+    """Index of the nearest target point of every query point: int32 [q] (see ``nearest``).
+
+    Raises:
+        ConfigError: no target, or values that are not finite.
+    """
+    require(len(target) >= 1, "nearest.target", len(target), ">= 1 point")
+    require(bool(np.isfinite(query).all() and np.isfinite(target).all()), "points", "NaN or infinity", "finite")
     index = np.empty(len(query), np.int32)
     nearest(np.ascontiguousarray(query), np.ascontiguousarray(target), index)
     return index

@@ -118,6 +118,8 @@ def test_what_cannot_be_continued_is_refused(data: tuple[CompletionDataset, Comp
         Trainer(SETTINGS, *data, tmp_path)
     with pytest.raises(ConfigError, match=r"another fit\.batch"):
         Trainer(replace(SETTINGS, batch=5), *data, tmp_path, resume=True)
+    with pytest.raises(ConfigError, match=r"another fit\.data"):
+        Trainer(SETTINGS, CompletionDataset("train", DATA, 1), data[1], tmp_path, resume=True)
     assert Trainer(replace(SETTINGS, steps=60), *data, tmp_path, resume=True).settings.steps == 60
     with pytest.raises(ModelError, match="not a checkpoint"):
         Trainer(SETTINGS, *data, tmp_path / "none", resume=True)
@@ -125,6 +127,15 @@ def test_what_cannot_be_continued_is_refused(data: tuple[CompletionDataset, Comp
     (tmp_path / CHECKPOINT).write_bytes(content[: len(content) // 2])
     with pytest.raises(ModelError, match="not a checkpoint"):
         Trainer(SETTINGS, *data, tmp_path, resume=True)
+
+
+def test_divergence_is_named(data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path) -> None:
+    trainer = Trainer(SETTINGS, *data, tmp_path)
+    batch = next(endless(trainer.train, 4, 0, 0, 0))
+    with torch.no_grad():
+        trainer.network.coarse3.bias[0] = float("nan")
+    with pytest.raises(ModelError, match="diverged at step 0"):
+        trainer.step(batch)
 
 
 def test_order_of_an_epoch_is_a_permutation_that_can_start_anywhere() -> None:

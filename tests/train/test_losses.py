@@ -74,6 +74,18 @@ def test_auction_finds_a_permutation_again_and_matches_a_single_point() -> None:
         assign(first, first[:-1])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_refused(value: float) -> None:
+    good = surface(np.random.default_rng(0), 8)
+    bad = good.copy()
+    bad[3, 1] = value
+    for first, second in ((good, bad), (bad, good)):
+        with pytest.raises(ConfigError, match="finite"):
+            assign(first, second)
+        with pytest.raises(ConfigError, match="finite"):
+            nearest_distance(first, second)
+
+
 @pytest.mark.parametrize("squared", [False, True])
 def test_chamfer_equals_its_definition(matcher: Matcher, squared: bool) -> None:
     rng = np.random.default_rng(1)
