@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -117,39 +118,53 @@ def _evaluate(options: argparse.Namespace) -> int:
     rows = [(f"{name} {c}", name, c) for name in (FULL, SMALL) for c in [*scores[FULL].classes, MACRO]]
     rows += [(name, name, MACRO) for name in scores if name not in (FULL, SMALL)]
     print(table(scores, rows))
+    for name in (FULL, SMALL):
+        print(f"{name} class accuracy {scores[name].summary('class_right').mean:.3f} (macro)")
     if options.json:
         options.json.write_text(json.dumps({name: asdict(one) for name, one in scores.items()}) + "\n")
     return int(ExitCode.OK)
 
 
 def _export(options: argparse.Namespace) -> int:
-    from train.card import write_card
     from train.checkpoint import load_checkpoint
-    from train.dataset import CompletionDataset, DatasetSettings
-    from train.evaluate import OnnxModel, evaluate, int8_is_good, spread
     from train.export import export
-    from train.manifest import FULL, SMALL, write_golden, write_manifest
+    from train.manifest import FULL, SMALL
     from train.quantize import quantize
 
-    checkpoint, folder = load_checkpoint(options.source), options.target
+    checkpoint, target = load_checkpoint(options.source), options.target
     if not checkpoint.step:
         raise ModelError(f"{options.source}: not trained yet", action="train first")
-    export(checkpoint.average, folder / FULL)
-    quantize(folder / FULL, folder / SMALL)
+    target.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as name:
+        folder = Path(name)
+        export(checkpoint.average, folder / FULL)
+        quantize(folder / FULL, folder / SMALL)
+        _measure(options, checkpoint, folder)
+        for path in sorted(folder.iterdir()):
+            path.replace(target / path.name)
+    print((target / "card.md").read_text())
+    return int(ExitCode.OK)
+
+
+def _measure(options: argparse.Namespace, checkpoint: Checkpoint, folder: Path) -> None:
+    """Choose the default file on the validation split, measure on the test split, write golden, manifest and card."""
+    from train.card import write_card
+    from train.dataset import CompletionDataset, DatasetSettings
+    from train.evaluate import OnnxModel, evaluate, int8_is_good, spread
+    from train.manifest import FULL, SMALL, write_golden, write_manifest
+
     models = {name: OnnxModel(folder / name) for name in (FULL, SMALL)}
     validation = CompletionDataset("val", DatasetSettings.default(), 0)
-    gate = evaluate(models, validation, options.samples, 0)
+    gate = evaluate(models, validation, options.samples, 0, threads=options.threads)
     default = SMALL if int8_is_good(gate, FULL, SMALL) else FULL
     inputs = [validation[index].partial for index in spread(len(validation), min(8, options.samples))]
     tolerance_m = write_golden(folder / "golden.npz", models, inputs)
     scores = _scores(options, folder, "test")
     training = _training(checkpoint, scores[default])
-    name = options.name or folder.name
+    name = options.name or options.target.name
     write_manifest(folder, name, default, options.rig or ["cascade_pair"], tolerance_m, training)
     files = {"int8": SMALL, "fp32": FULL} if default == SMALL else {"fp32": FULL, "int8": SMALL}
     write_card(folder / "card.md", name, scores, files, training, _commands(options, checkpoint.settings))
-    print((folder / "card.md").read_text())
-    return int(ExitCode.OK)
 
 
 def _training(checkpoint: Checkpoint, scores: Scores) -> dict[str, Any]:
