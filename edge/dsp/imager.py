@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from edge.dsp.antenna import along_loss_db
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
 from edge.dsp.interpolation import fit_response
 from edge.dsp.kernels_checks import all_zero, dead_channels
-from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, set_motion
+from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
 from edge.errors import CaptureError
 from edge.frames import Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 SHORTEST_RANGE_M = 0.05
 ANGLE_LANES = 32
+MOST_SECTORS = 9
+LARGEST_MOTION_ERROR_RAD = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +76,9 @@ class Imager:
 
     Power is LSB^2 per complex sample: a point target of amplitude a LSB in the middle of a cell gives a^2, divided by
     the two-way antenna gain along the array. Elements of the virtual row that are missing are zeros; doubled ones are
-    averaged. Motion of the rig: its boresight part is undone per slot (exact at boresight). Its part along the array is
-    a phase 4 pi v u t / lambda that differs from angle to angle and cannot be undone before one FFT: its least-squares
-    scale of the direction cosine, 1 + 2 v sum(w p t) / sum(w p^2), is undone in the heatmap's axis. The rest stays,
-    0.28 rad rms per element at 1 m/s and 45 degrees; it raises a target's sidelobes at 35 degrees from -29 dB (0 m/s)
-    to -26 (0.5), -19 (1), -15 (1.5) and -7 dB (3 m/s) with Hann windows, without moving its peak by 0.1 bin.
+    averaged. The rig's motion turns slot s by 4 pi (v . d) t_s / lambda, which differs from direction d to direction:
+    the field of view is divided into as many sectors as keep the error at a sector's edge below 0.15 rad rms over the
+    row (one up to 0.5 m/s along the array, six at 3 m/s, at most nine), each with its own compensation and angle FFT.
 
     Args:
         radar: board, mounting, schedule, calibration.
@@ -111,12 +112,13 @@ class Imager:
 
     def _make_axes(self, antenna: AntennaSettings) -> None:
         bins = self.settings.angle_bins
-        self._direction_cosine = (np.arange(bins) - bins // 2) / (bins * self.geometry.pitch)
+        cosine = (np.arange(bins) - bins // 2) / (bins * self.geometry.pitch)
         bin_m = SPEED_OF_LIGHT_M_S * self._profile.sample_rate_hz / (2.0 * self._profile.slope_hz_per_s_actual)
         range_m = np.arange(self.points) * bin_m / self.points + self.radar.mounting.range_offset_m
         self.range_m = range_m.astype(np.float32)
-        self.direction_cosine = self._direction_cosine.astype(np.float32)
-        self._gain = (10.0 ** (0.2 * along_loss_db(antenna, self._direction_cosine))).astype(np.float32)
+        self.direction_cosine = cosine.astype(np.float32)
+        self._gain = (10.0 ** (0.2 * along_loss_db(antenna, cosine))).astype(np.float32)
+        self._sectors = tuple(tdm.divide(cosine, count) for count in range(1, MOST_SECTORS + 1))
         self._focus_range_m = np.maximum(range_m, SHORTEST_RANGE_M)
 
     def _make_blocks(self) -> None:
@@ -167,7 +169,7 @@ class Imager:
         self._make_response(taper, angle_taper, weight)
 
     def _make_response(self, taper: Float64, angle_taper: Float64, weight: Float64) -> None:
-        """How motion and the spherical wavefront move a target's peak: weighted least squares over the row.
+        """What motion and the spherical wavefront do to a target's peak: weighted least squares over the row.
 
         With p = a + b the position and q = a^2 + b^2 of a channel, the two-way path of a target at (r, u) is
         2 r - p u + q (1 - u^2) / (2 r) to second order, and a channel's time t adds -2 v u t along the array.
@@ -177,7 +179,10 @@ class Imager:
         mean_q = (weight * q).sum() / weight.sum()
         p = p - (weight * p).sum() / weight.sum()
         slope = weight * p / (weight * p * p).sum()
-        self._motion_per_m_s = float(2.0 * (slope * self._transmit_time_s[:, None]).sum())
+        moved = 2.0 * (self._transmit_time_s[:, None] - p * (slope * self._transmit_time_s[:, None]).sum())
+        moved = moved - (weight * moved).sum() / weight.sum()
+        mean_square = (weight * moved * moved).sum() / weight.sum()
+        self._motion_rad_s_m = float(2.0 * np.pi / self._wavelength_m * np.sqrt(mean_square))
         focus_inverse_m = -1.0 if self.settings.focus else 0.5 / self.radar.calibration.reference_range_m
         inside = weight > 0.0
         bin_m = float(self.range_m[1] - self.range_m[0])
@@ -193,15 +198,17 @@ class Imager:
     def _make_buffers(self) -> None:
         layout, bins, plane = self.layout, self.settings.angle_bins, self.points * self.layout.rx
         self._range_kernel = range_kernel(layout.kind == "cascade", layout.iq_order == "QI", self.points, layout.rx)
+        self._row_kernel = row_kernel(self.points, layout.rx)
         self._angle_kernel = angle_kernel(bins, self.points, ANGLE_LANES)
         self._range_twiddle = tables.twiddles(self.points, -1, layout.rx)
         self._angle_twiddle = tables.twiddles(bins, +1, 0)
         frequency = tables.frequency_of_row(self.points)
         self._rows = np.argsort(frequency).astype(np.int64) * layout.rx
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
-        self._phasor = np.zeros((layout.slots, 2), dtype=np.float32)
+        self._phasor = np.ones(layout.slots, dtype=np.complex64)
+        self._spectra = np.zeros((len(self._pairs), 2 * plane), dtype=np.float32)
         self._sums = np.zeros(2 * plane, dtype=np.float32)
-        self._range_work = np.zeros(2 * plane, dtype=np.float32)
+        self._row_work = np.zeros(2 * plane, dtype=np.float32)
         self._angle_work = np.zeros(2 * bins * ANGLE_LANES, dtype=np.float32)
         self._row = np.zeros((2, self.geometry.count, self.points), dtype=np.float32)
         self._power = np.zeros((bins, self.points), dtype=np.float32)
@@ -242,28 +249,50 @@ class Imager:
         if all_zero(adc):
             raise reject_all_zero(frame)
         loops = self.loops_for(velocity_rig_m_s)
-        self._set_motion(velocity_rig_m_s, slot_phasors, loops)
         self._report(adc, loops, self._run_range(adc, loops))
         if self.last_report.saturated_share > self.settings.max_saturated_share:
             raise reject_saturated(frame, self.last_report.saturated_share, self.settings.max_saturated_share)
-        self._run_angle()
+        if slot_phasors is not None:
+            np.divide(slot_phasors, loops, out=self._phasor, casting="same_kind")
+            self._run_angle(self._sectors[0][0])
+        else:
+            self._run_sectors(velocity_rig_m_s, loops)
         return Heatmap(
             *(frame.radar, frame.number, frame.t_first_chirp_ns, self._power, self.direction_cosine, self.range_m),
             response=self._response,
         )
 
     def _run_range(self, adc: NDArray[np.int32], loops: int) -> int:
-        """Fill ``_row`` from the raw words; returns the codes at the rails."""
+        """Fill ``_spectra`` from the raw words; returns the codes at the rails."""
         rails = self._range_kernel(
-            *(adc, loops, self._loop_stride, self._block_start, self._block_slot, self._block_element),
-            *(self.layout.samples, self._window, self._focus, self._phasor, self._range_twiddle, self._rows),
-            *(self._sums, self._range_work, self._row),
+            *(adc, loops, self._loop_stride, self._block_start, self.layout.samples, self._window),
+            *(self._range_twiddle, self._sums, self._spectra),
         )
         return int(rails)
 
-    def _run_angle(self) -> None:
-        """Fill ``_power`` from ``_row``."""
-        self._angle_kernel(self._row, self._angle_twiddle, self._target, self._gain, self._angle_work, self._power)
+    def _run_sectors(self, velocity: Float64 | None, loops: int) -> None:
+        """Undo the motion and fill ``_power``, sector by sector."""
+        forward_m_s = 0.0 if velocity is None else float(velocity[0])
+        along_m_s = 0.0 if velocity is None else float(velocity[tdm.array_axis(self.radar.radar)])
+        for sector in self._sectors[self._sector_count(along_m_s) - 1]:
+            closing_m_s = forward_m_s * math.sqrt(1.0 - sector.centre**2) + along_m_s * sector.centre
+            set_phasors(self._phasor, -closing_m_s, self._transmit_time_s, self._wavelength_m, float(loops))
+            self._run_angle(sector)
+
+    def _sector_count(self, along_m_s: float) -> int:
+        error_rad = self._motion_rad_s_m * abs(along_m_s) * tdm.FOV_COSINE
+        return min(max(1, math.ceil(error_rad / LARGEST_MOTION_ERROR_RAD)), MOST_SECTORS)
+
+    def _run_angle(self, sector: tdm.Sector) -> None:
+        """Fill the sector's rows of ``_power`` from ``_spectra`` and ``_phasor``."""
+        self._row_kernel(
+            *(self._spectra, self._block_slot, self._block_element, self._focus, self._rows, self._phasor),
+            *(self._row_work, self._row),
+        )
+        self._angle_kernel(
+            *(self._row, self._angle_twiddle, self._target, self._gain, sector.first, sector.last),
+            *(self._angle_work, self._power),
+        )
 
     def _packed(self, frame: RadarFrame) -> NDArray[np.int32]:
         """The frame as int32 words; copied only when its memory is not aligned to them."""
@@ -272,15 +301,6 @@ class Imager:
             return words
         np.copyto(self._aligned, words)
         return self._aligned
-
-    def _set_motion(self, velocity: Float64 | None, slot_phasors: Complex64 | None, loops: int) -> None:
-        """Phasor of every slot, divided by the loops, and the direction axis of the heatmap."""
-        forward_m_s = 0.0 if velocity is None else float(velocity[0])
-        along_m_s = 0.0 if velocity is None else float(velocity[tdm.array_axis(self.radar.radar)])
-        if slot_phasors is None:
-            slot_phasors = tdm.speed_phasors(-forward_m_s, self._transmit_time_s, self._wavelength_m)
-        scale = 1.0 + self._motion_per_m_s * along_m_s
-        set_motion(self._phasor, self.direction_cosine, slot_phasors, float(loops), self._direction_cosine, scale)
 
     def _report(self, adc: NDArray[np.int32], loops: int, rails: int) -> None:
         layout = self.layout
@@ -293,5 +313,5 @@ class Imager:
 
     @property
     def row(self) -> Float32:
-        """Calibrated, focused, tapered spectra [(re, im), element, range] of the last frame."""
+        """Calibrated, focused, tapered spectra [(re, im), element, range] of the last frame's last sector."""
         return self._row

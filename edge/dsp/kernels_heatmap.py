@@ -144,12 +144,12 @@ def _window(acc, window, b, work, im):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _focus(work, focus, b, pr, pi, im):  # type: ignore[no-untyped-def]
-    """Multiply the spectrum, in memory order, by the focusing phasor, the taper and the slot's Doppler phasor."""
+def _focus(spectrum, focus, b, pr, pi, work, im):  # type: ignore[no-untyped-def]
+    """The spectrum, in memory order, times the focusing phasor, the taper and the slot's Doppler phasor."""
     for x in range(im):
         fr, fi = focus[b, 0, x], focus[b, 1, x]
         cr, ci = fr * pr - fi * pi, fr * pi + fi * pr
-        re, i = work[x], work[x + im]
+        re, i = spectrum[x], spectrum[x + im]
         work[x] = re * cr - i * ci
         work[x + im] = re * ci + i * cr
 
@@ -176,23 +176,19 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
         points: length of the FFT, a power of two, 64..1024; shorter chirps are zero-padded.
         rx: receivers of one device.
     Returns:
-        kernel(adc [values / 2], loops, loop_stride, start int64 [block], slot int64 [block], element int64 [block, rx],
-        samples, window [block, 2, points * rx], focus [block, 2, points * rx] in memory order, phasor [slot, 2],
-        twiddle, rows int64 [points], acc [2 * points * rx], work [2 * points * rx], row [2, element, points])
-        -> components at the rails.
-        ``row`` is overwritten; ``acc`` must hold zeros beyond ``samples * rx`` of each plane.
+        kernel(adc [values / 2], loops, loop_stride, start int64 [block], samples, window [block, 2, points * rx],
+        twiddle, acc [2 * points * rx], spectra [block, 2 * points * rx]) -> components at the rails.
+        ``spectra`` receives each block's [(re, im), row, rx] with digit-reversed rows; ``acc`` must hold zeros beyond
+        ``samples * rx`` of each plane.
     """
     im = points * rx
     radix2 = points in (128, 512)
     signature = int64(
-        *(RAW, int64, int64, int64[::1], int64[::1], int64[:, ::1], int64, float32[:, :, ::1], float32[:, :, ::1]),
-        *(float32[:, ::1], float32[::1], int64[::1], float32[::1], float32[::1], float32[:, :, ::1]),
+        *(RAW, int64, int64, int64[::1], int64, float32[:, :, ::1], float32[::1], float32[::1], float32[:, ::1])
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(adc, loops, loop_stride, start, slot, element, samples, window, focus,  # type: ignore[no-untyped-def]
-               phasor, twiddle, rows, acc, work, row):  # fmt: skip
-        row[:] = float32(0)
+    def kernel(adc, loops, loop_stride, start, samples, window, twiddle, acc, spectra):  # type: ignore[no-untyped-def]
         rails = 0
         to_i = im if swapped else 0
         for b in range(len(start)):
@@ -203,6 +199,7 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
                     rails += int64(_add_interleaved(adc, first, samples * rx, keep, acc, to_i, im - to_i))
                 else:
                     rails += int64(_add_pairwise(adc, first, samples, rx, keep, acc, to_i, im - to_i))
+            work = spectra[b]
             _window(acc, window, b, work, im)
             _wide_stage(work, twiddle, 0, 1, im // 4, im)
             _wide_stage(work, twiddle, 2 * (im - im // 4), 4, im // 16, im)
@@ -214,29 +211,54 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
                 _pair_stage(work, points // 2, rx, im)
             else:
                 _last_stage(work, points // 4, rx, im, float32(-1))
-            _focus(work, focus, b, phasor[slot[b], 0], phasor[slot[b], 1], im)
-            _gather(work, rows, element[b], points, rx, im, row)
         return rails
 
     return kernel
 
 
-@njit(types.void(float32[:, ::1], float32[::1], complex64[::1], float64, float64[::1], float64), **OPTIONS)
-def set_motion(phasor, axis, slot_phasors, loops, unmoved_axis, scale):  # type: ignore[no-untyped-def]
-    """Write the slots' phasors over the number of summed loops, and the direction axis over the motion's scale.
+@cache
+def row_kernel(points: int, rx: int) -> Callable[..., Any]:
+    """Compile the kernel that focuses the blocks' spectra, undoes motion for one direction and fills the virtual row.
 
     Args:
-        phasor: float32 [slots, 2], receives real and imaginary parts.
-        axis: float32 [angle], receives the direction cosines.
-        slot_phasors: complex64 [slots].
-        loops: loops that are summed.
-        unmoved_axis: float64 [angle].
-        scale: 1 + the motion's share.
+        points: range bins.
+        rx: receivers of one device.
+    Returns:
+        kernel(spectra [block, 2 * points * rx], slot int64 [block], element int64 [block, rx], focus [block, 2,
+        points * rx] in memory order, rows int64 [points], phasor complex64 [slot], work [2 * points * rx],
+        row [2, element, points]); ``row`` is overwritten.
     """
-    for s in range(len(slot_phasors)):
-        phasor[s, 0], phasor[s, 1] = slot_phasors[s].real / loops, slot_phasors[s].imag / loops
-    for a in range(len(axis)):
-        axis[a] = unmoved_axis[a] / scale
+    im = points * rx
+    signature = types.void(
+        *(float32[:, ::1], int64[::1], int64[:, ::1], float32[:, :, ::1], int64[::1], complex64[::1]),
+        *(float32[::1], float32[:, :, ::1]),
+    )
+
+    @njit(signature, **OPTIONS)
+    def kernel(spectra, slot, element, focus, rows, phasor, work, row):  # type: ignore[no-untyped-def]
+        row[:] = float32(0)
+        for b in range(len(slot)):
+            turn = phasor[slot[b]]
+            _focus(spectra[b], focus, b, turn.real, turn.imag, work, im)
+            _gather(work, rows, element[b], points, rx, im, row)
+
+    return kernel
+
+
+@njit(types.void(complex64[::1], float64, float64[::1], float64, float64), **OPTIONS)
+def set_phasors(phasor, radial_m_s, time_s, wavelength_m, loops):  # type: ignore[no-untyped-def]
+    """Factors that undo a radial speed between slots: exp(-j 4 pi v t_s / lambda) / loops.
+
+    Args:
+        phasor: complex64 [slots], receives the factors.
+        radial_m_s: positive away.
+        time_s: float64 [slots] after the first chirp.
+        wavelength_m: at the middle of the ADC window.
+        loops: loops that were summed.
+    """
+    for s in range(len(phasor)):
+        angle = -4.0 * np.pi * radial_m_s * time_s[s] / wavelength_m
+        phasor[s] = complex(np.cos(angle) / loops, np.sin(angle) / loops)
 
 
 @njit(inline="always")
@@ -280,17 +302,18 @@ def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
         points: range bins.
         lanes: range bins per vector.
     Returns:
-        kernel(row [2, element, points], twiddle, target int64 [bins], gain [bins], work [2 * bins * lanes],
-        power [bins, points]); row ``target[i]`` of ``power`` receives FFT row i times ``gain[target[i]]``.
+        kernel(row [2, element, points], twiddle, target int64 [bins], gain [bins], first, last, work [2 * bins *
+        lanes], power [bins, points]); row ``target[i]`` of ``power`` receives FFT row i times ``gain[target[i]]`` when
+        first <= target[i] < last.
     """
     im = bins * lanes
     radix2 = bins in (128, 512, 2048)
     signature = types.void(
-        float32[:, :, ::1], float32[::1], int64[::1], float32[::1], float32[::1], float32[:, ::1]
-    )  # fmt: skip
+        *(float32[:, :, ::1], float32[::1], int64[::1], float32[::1], int64, int64, float32[::1], float32[:, ::1])
+    )
 
     @njit(signature, **OPTIONS)
-    def kernel(row, twiddle, target, gain, work, power):  # type: ignore[no-untyped-def]
+    def kernel(row, twiddle, target, gain, first, last, work, power):  # type: ignore[no-untyped-def]
         for column in range(0, points, lanes):
             _pruned_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
             _narrow_stage(work, twiddle, 2 * (bins - bins // 4), 4, bins // 16, lanes, im)
@@ -306,6 +329,8 @@ def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
                 _last_stage(work, bins // 4, lanes, im, float32(1))
             for i in range(bins):
                 t = target[i]
+                if t < first or t >= last:
+                    continue
                 for l in range(lanes):  # noqa: E741
                     re, imag = work[i * lanes + l], work[i * lanes + l + im]
                     power[t, column + l] = (re * re + imag * imag) * gain[t]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -75,3 +76,31 @@ def doppler_phasors(doppler_bin: float, loops: int, slots: int) -> Complex64:
     """
     phase = 2.0 * np.pi * doppler_bin * np.arange(slots) / (slots * loops)
     return np.asarray(np.exp(-1j * phase), dtype=np.complex64)
+
+
+@dataclass(frozen=True, slots=True)
+class Sector:
+    """Rows of a heatmap that share one compensation of the rig's motion.
+
+    Args:
+        centre: direction cosine that is compensated exactly.
+        first, last: rows first <= row < last.
+    """
+
+    centre: float
+    first: int
+    last: int
+
+
+def divide(direction_cosine: Float64, count: int) -> tuple[Sector, ...]:
+    """Divide the field of view, 45 degrees to both sides, into equal sectors; the outer ones reach the axis' ends.
+
+    Args:
+        direction_cosine: [angle], ascending.
+        count: sectors.
+    """
+    bounds = np.linspace(-FOV_COSINE, FOV_COSINE, count + 1)
+    rows = np.searchsorted(direction_cosine, bounds)
+    rows[0], rows[-1] = 0, len(direction_cosine)
+    centres = 0.5 * (bounds[1:] + bounds[:-1])
+    return tuple(Sector(float(c), int(a), int(b)) for c, a, b in zip(centres, rows[:-1], rows[1:], strict=True))

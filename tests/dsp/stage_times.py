@@ -28,8 +28,14 @@ def main(count: int) -> None:
     adc, power, tables, rank = imager._packed(frame), heatmap.power, ca._tables, os_._tables
     stages = {
         "range": lambda: imager._run_range(adc, 1),
-        "angle": lambda: imager._run_angle(),
+        "row": lambda: imager._row_kernel(
+            *(imager._spectra, imager._block_slot, imager._block_element, imager._focus, imager._rows),
+            *(imager._phasor, imager._row_work, imager._row),
+        ),
+        "row + angle": lambda: imager._run_angle(imager._sectors[0][0]),
         "imager": lambda: imager.process(frame),
+        "imager 1.5 m/s": lambda: imager.process(frame, np.array([0.0, 1.5, 0.0])),
+        "imager 3 m/s": lambda: imager.process(frame, np.array([0.0, 3.0, 0.0])),
         "ring mean": lambda: ca._estimate(power),
         "peaks": lambda: mean_peaks(power, ca._noise, tables.factor, tables.first, ca._cells, ca._estimates),
         "detector CA": lambda: ca.process(heatmap),
@@ -47,7 +53,7 @@ def main(count: int) -> None:
             stage()
             times[name][n] = time.perf_counter() - start
     for name, spent in times.items():
-        print(f"{name:12s} median {1e3 * np.median(spent):.3f} ms, fastest {1e3 * spent.min():.3f} ms")
+        print(f"{name:14s} median {1e3 * np.median(spent):.3f} ms, fastest {1e3 * spent.min():.3f} ms")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from dsp_radars import calibrated, cascade_radar, place, relaid, single_chip_rad
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
-from edge.dsp.tdm import doppler_phasors
+from edge.dsp.tdm import divide, doppler_phasors
 from edge.errors import ConfigError
 from edge.reference.heatmap import range_angle_power
 from edge.reference.point_targets import make_frame
@@ -209,6 +209,13 @@ def test_more_bins_than_twice_the_row_are_needed():
         Imager(cascade_radar(), HeatmapSettings(angle_bins=128), FLAT)
 
 
+def far_lobe_db(power):
+    """Highest power beyond 7 rows of the peak, outside Hann's main lobe of 6, in the peak's range cell."""
+    row = power[:, power.max(axis=0).argmax()]
+    away = np.abs((np.arange(256) - row.argmax() + 128) % 256 - 128)
+    return 10 * np.log10(row[away > 7].max() / row.max())
+
+
 class TestMotion:
     @pytest.mark.parametrize("speed_m_s", [0.5, 2.0])
     def test_forward_motion_is_undone_between_slots(self, speed_m_s):
@@ -233,16 +240,33 @@ class TestMotion:
         assert abs(np.degrees(np.arcsin(cosine)) - 20) < 0.02
         assert power_db == pytest.approx(60, abs=0.2)
 
-    @pytest.mark.parametrize(("which", "axis"), [("horizontal", 1), ("vertical", 2)])
-    @pytest.mark.parametrize("sign", [1, -1])
-    def test_travel_along_the_array_does_not_bend_angles(self, which, axis, sign):
+    @pytest.mark.parametrize(("which", "axis", "sign"), [("horizontal", 1, 1), ("vertical", 2, 1), ("vertical", 2, -1)])
+    @pytest.mark.parametrize("speed_m_s", [0.4, -1.5, 3.0])
+    @pytest.mark.parametrize("angle_deg", [-20.7, 12.0, 35.0])
+    def test_travel_along_the_array_is_undone_in_every_direction(self, which, axis, sign, speed_m_s, angle_deg):
+        """-20.7 degrees at -1.5 m/s lies near the border of two sectors."""
         radar = cascade_radar(which, array_sign=sign)
         velocity = np.zeros(3)
-        velocity[axis] = 2.0
-        truth = np.sin(np.radians(35))
-        frame = make_frame(radar, [place(6.0, 35, which)], 1e3, 0, 0, velocity_rig_m_s=velocity)
-        assert abs(strongest(radar, frame, velocity_rig_m_s=velocity)[1] - truth) < 0.07 * BIN
-        assert abs(strongest(radar, frame)[1] - truth) > 0.15 * BIN
+        velocity[axis] = speed_m_s
+        truth = np.sin(np.radians(angle_deg))
+        frame = make_frame(radar, [place(6.0, angle_deg, which)], 1e3, 0, 0, velocity_rig_m_s=velocity)
+        imager = Imager(radar, HeatmapSettings(), FLAT)
+        heatmap = imager.process(frame, velocity)
+        assert far_lobe_db(heatmap.power) < -18.0
+        found = Detector(radar, CfarSettings()).process(heatmap)
+        assert abs(found.range_m[0] - 6.0) < 1e-3
+        assert abs(found.direction_cosine[0] - truth) < 0.1 * BIN
+        assert found.power_db[0] == pytest.approx(60.0, abs=0.2)
+        if abs(speed_m_s) > 1 and angle_deg == 35.0:
+            assert far_lobe_db(imager.process(frame).power) > -16.0
+
+    def test_sectors_cover_every_row_once(self):
+        cosine = (np.arange(256) - 128) / (256 * 0.5126)
+        for count in range(1, 10):
+            sectors = divide(cosine, count)
+            assert [s.first for s in sectors] == [0] + [s.last for s in sectors[:-1]]
+            assert sectors[-1].last == 256
+            assert np.allclose([s.centre for s in sectors], -np.array([s.centre for s in sectors])[::-1])
 
     def test_loops_follow_the_ego_speed(self):
         radar = cascade_radar(loops=8)

@@ -17,7 +17,7 @@ from edge.dsp.imager import Imager
 from edge.dsp.kernels_cfar import mean_peaks
 from edge.dsp.kernels_checks import all_zero, dead_channels
 from edge.dsp.kernels_detect import refine, strongest
-from edge.dsp.kernels_heatmap import set_motion
+from edge.dsp.kernels_heatmap import set_phasors
 from edge.reference.point_targets import make_frame
 
 LARGEST_TEMPORARY_BYTES = 32768
@@ -50,7 +50,16 @@ def array_arguments(kernel):
 
 def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(road):
     imager, detector, run = road
-    kernels = [all_zero, dead_channels, set_motion, imager._range_kernel, imager._angle_kernel, strongest, refine]
+    kernels = [
+        all_zero,
+        dead_channels,
+        set_phasors,
+        imager._range_kernel,
+        imager._row_kernel,
+        imager._angle_kernel,
+        strongest,
+        refine,
+    ]
     kernels += [detector._rank_peaks] if detector.settings.kind == "os" else [detector._ring_mean, mean_peaks]
     _nrt_python.memsys_enable_stats()
     try:
