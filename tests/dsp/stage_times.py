@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 
@@ -24,6 +25,7 @@ def main(count: int) -> None:
     imager = Imager(radar, HeatmapSettings(), AntennaSettings())
     ca, os_ = (Detector(radar, CfarSettings(kind=kind)) for kind in ("ca", "os"))
     heatmap = imager.process(frame)
+    heatmap = dataclasses.replace(heatmap, power=heatmap.power.copy())
     print(f"{len(ca.process(heatmap))} CA detections, {len(os_.process(heatmap))} OS detections")
     adc, power, tables, rank = imager._packed(frame), heatmap.power, ca._tables, os_._tables
     stages = {
