@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The road: raw frames and poses in; heatmaps, detections, fused clouds and completed shapes out.
+
+It wires the stages together and keeps the account of every frame; nothing is computed here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from edge.accounting import FrameLedger
+from edge.completion.model import CompletionModel
+from edge.dsp.checks import FrameRejected
+from edge.dsp.detector import Detector
+from edge.dsp.imager import Imager
+from edge.errors import CaptureError, ModelError, PoseError
+from edge.frames import (
+    RADARS,
+    Detections,
+    Float64,
+    FusedCloud,
+    Heatmap,
+    LossCause,
+    ObjectCloud,
+    PointCloud,
+    Pose,
+    RadarFrame,
+    RadarId,
+    Shape,
+)
+from edge.fusion.association import Associator
+from edge.fusion.objects import ObjectTracker
+from edge.fusion.temporal import TemporalFusion
+from edge.odometry.track import PoseTrack
+from edge.rig import Rig
+from edge.sources.base import Loss
+from edge.sources.pairing import FramePair, FramePairer
+from edge.timing import StageTimes
+
+MAX_WAITING_PAIRS = 64
+"""Frame pairs that wait for a later pose before the oldest is given up: about a second at 60 frames/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """What one frame of each radar gave.
+
+    Args:
+        number: frame number.
+        t_ns: first chirp of the first radar's burst.
+        heatmaps: radar id -> heatmap; valid until the pipeline's next frame.
+        detections: radar id -> detections.
+        cloud: associated 3-D points; None in a rig of one radar.
+        pose: of the rig at ``t_ns``; None in a rig of one radar that has no poses.
+    """
+
+    number: int
+    t_ns: int
+    heatmaps: Mapping[RadarId, Heatmap]
+    detections: Mapping[RadarId, Detections]
+    cloud: PointCloud | None
+    pose: Pose | None
+
+
+@dataclass(frozen=True, slots=True)
+class WindowResult:
+    """What one window of travel gave.
+
+    Args:
+        cloud: all points of the window.
+        objects: its objects.
+        shapes: their completions; an object without enough points has none.
+    """
+
+    cloud: FusedCloud
+    objects: Sequence[ObjectCloud]
+    shapes: Sequence[Shape]
+
+
+class Sink(Protocol):
+    """Where results go: the publisher, a recorder, pictures."""
+
+    def frame(self, result: FrameResult) -> None:
+        """One frame of each radar is done."""
+
+    def window(self, result: WindowResult) -> None:
+        """One window of travel is done."""
+
+
+@dataclass(slots=True)
+class Faults:
+    """What went wrong apart from lost frames, counted; ``last`` says the newest in words.
+
+    Args:
+        poses_refused: poses that were no poses or went backwards in time.
+        shapes_withheld: objects whose completion was not finite or failed.
+        dead_channels: radar id -> names of channels that gave constant values.
+        last: newest message.
+    """
+
+    poses_refused: int = 0
+    shapes_withheld: int = 0
+    dead_channels: dict[RadarId, tuple[str, ...]] = field(default_factory=dict)
+    last: str = ""
+
+
+class Pipeline:
+    """All stages of one rig in one thread.
+
+    Args:
+        rig: radars, geometry and settings.
+        completion: the network; None: fused clouds and objects only.
+        sinks: called in order with every result.
+    """
+
+    def __init__(self, rig: Rig, completion: CompletionModel | None, sinks: Sequence[Sink] = ()) -> None:
+        settings = rig.settings
+        self.rig, self.sinks, self._completion = rig, list(sinks), completion
+        self.radars: tuple[RadarId, ...] = tuple(radar for radar in RADARS if radar in rig.radars)
+        self.ledgers: dict[RadarId, FrameLedger] = {radar: FrameLedger(radar) for radar in self.radars}
+        self.times, self.faults = StageTimes(), Faults()
+        self._imagers = {r: Imager(rig.radars[r], settings.heatmap, settings.antenna) for r in self.radars}
+        self._detectors = {r: Detector(rig.radars[r], settings.cfar) for r in self.radars}
+        self._pairer = FramePairer(self.radars)
+        self._track = PoseTrack(settings.fusion.max_pose_gap_s)
+        self._associator = Associator(rig) if len(self.radars) == len(RADARS) else None
+        self._fusion = TemporalFusion(settings.fusion)
+        self._tracker = ObjectTracker(settings.objects, rig.geometry)
+        self._waiting: deque[FramePair] = deque()
+
+    def feed(self, item: RadarFrame | Pose | Loss) -> None:
+        """Take the next frame, pose or loss of a source, in the source's order."""
+        if isinstance(item, Pose):
+            self._add_pose(item)
+        elif isinstance(item, Loss):
+            self._lose_at_source(item)
+        else:
+            self._add_frame(item)
+        self._work()
+
+    def finish(self) -> None:
+        """The source has ended: what still waits is processed or counted, the last window is closed."""
+        for loss in self._pairer.flush():
+            self._lose(loss)
+        self._work()
+        while self._waiting:
+            self._lose_pair(self._waiting.popleft(), LossCause.NO_POSE)
+        self._close(self._fusion.flush())
+        for ledger in self.ledgers.values():
+            ledger.check()
+
+    def _add_pose(self, pose: Pose) -> None:
+        try:
+            self._track.add(pose)
+        except PoseError as error:
+            self.faults.poses_refused += 1
+            self.faults.last = str(error)
+
+    def _add_frame(self, frame: RadarFrame) -> None:
+        if frame.radar not in self.ledgers:
+            raise CaptureError(
+                f"frame {frame.number} comes from a radar that rig {self.rig.name} does not have",
+                value=frame.radar,
+                allowed=", ".join(self.radars),
+                action="play the recording with the rig that it was made with",
+            )
+        self.ledgers[frame.radar].frame_in()
+        pairs, losses = self._pairer.add(frame)
+        for loss in losses:
+            self._lose(loss)
+        self._waiting.extend(pairs)
+
+    def _lose_at_source(self, loss: Loss) -> None:
+        """A frame that the source knows of but could not deliver comes in and is lost at once."""
+        if loss.radar in self.ledgers:
+            self.ledgers[loss.radar].frame_in()
+            self._lose(loss)
+
+    def _lose(self, loss: Loss) -> None:
+        self.ledgers[loss.radar].lost(loss.cause)
+        self.faults.last = loss.detail or self.faults.last
+
+    def _lose_pair(self, pair: FramePair, cause: LossCause) -> None:
+        for radar in pair.frames:
+            self.ledgers[radar].lost(cause)
+
+    def _work(self) -> None:
+        """Process every waiting pair whose pose is known."""
+        while self._waiting:
+            pair = self._waiting[0]
+            pose = self._track.at(pair.t_ns)
+            if pose is None and self._associator is not None:
+                too_many = len(self._waiting) > MAX_WAITING_PAIRS
+                if self._track.may_still_come(pair.t_ns) and not too_many:
+                    return
+                self._lose_pair(self._waiting.popleft(), LossCause.NO_POSE)
+                continue
+            self._waiting.popleft()
+            self._process(pair, pose)
+
+    def _process(self, pair: FramePair, pose: Pose | None) -> None:
+        velocity_m_s = self._track.velocity_rig_m_s(pair.t_ns)
+        heatmaps = self._image(pair, velocity_m_s)
+        if len(heatmaps) < len(self.radars):
+            return
+        detections: dict[RadarId, Detections] = {}
+        for radar, heatmap in heatmaps.items():
+            with self.times.measure("detect"):
+                detections[radar] = self._detectors[radar].process(heatmap)
+        cloud = self._associate(detections, velocity_m_s)
+        for radar in pair.frames:
+            self.ledgers[radar].ok()
+        result = FrameResult(pair.number, pair.t_ns, heatmaps, detections, cloud, pose)
+        for sink in self.sinks:
+            sink.frame(result)
+        if cloud is not None and pose is not None:
+            with self.times.measure("fuse"):
+                fused = self._fusion.add(cloud, pose)
+            self._close(fused)
+
+    def _image(self, pair: FramePair, velocity_m_s: Float64 | None) -> dict[RadarId, Heatmap]:
+        """Heatmaps of all radars; when one frame is refused its partner is lost with it."""
+        heatmaps: dict[RadarId, Heatmap] = {}
+        causes: dict[RadarId, LossCause] = {}
+        for radar, frame in pair.frames.items():
+            try:
+                with self.times.measure("heatmap"):
+                    heatmaps[radar] = self._imagers[radar].process(frame, velocity_m_s)
+                self.faults.dead_channels[radar] = self._imagers[radar].last_report.dead
+            except FrameRejected as rejected:
+                causes[radar] = rejected.cause
+                self.faults.last = str(rejected)
+        if causes:
+            for radar in pair.frames:
+                self.ledgers[radar].lost(causes.get(radar, LossCause.UNPAIRED))
+            return {}
+        return heatmaps
+
+    def _associate(self, detections: Mapping[RadarId, Detections], velocity_m_s: Float64 | None) -> PointCloud | None:
+        if self._associator is None:
+            return None
+        with self.times.measure("associate"):
+            return self._associator.process(detections["horizontal"], detections["vertical"], velocity_m_s)
+
+    def _close(self, cloud: FusedCloud | None) -> None:
+        """Segment and complete a finished window."""
+        if cloud is None:
+            return
+        with self.times.measure("objects"):
+            objects = self._tracker.process(cloud)
+        shapes = [shape for shape in map(self._complete, objects) if shape is not None]
+        for sink in self.sinks:
+            sink.window(WindowResult(cloud, objects, shapes))
+
+    def _complete(self, cloud: ObjectCloud) -> Shape | None:
+        if self._completion is None:
+            return None
+        try:
+            with self.times.measure("complete"):
+                return self._completion.complete(cloud)
+        except ModelError as error:
+            self.faults.shapes_withheld += 1
+            self.faults.last = str(error)
+            return None

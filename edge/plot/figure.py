@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The look that all pictures share, and how they are written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from edge.errors import DependencyError
+
+INK, MUTED, GRID = "#1b1f24", "#6b7280", "#d9dde3"
+HORIZONTAL, VERTICAL, BOTH, INPUT, COARSE = "#1f6fb4", "#c8641b", "#1a7f5a", "#c0392b", "#7a4fb0"
+DPI = 130
+
+
+def new_figure(width_in: float, height_in: float, title: str, subtitle: str = "") -> Any:
+    """An empty figure with a title at its top left.
+
+    Args:
+        width_in, height_in: size in inches.
+        title: what it shows.
+        subtitle: one muted line below it.
+    Raises:
+        DependencyError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise DependencyError("pictures need matplotlib", action="pip install 'rfconstruct[plot]'") from error
+    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    head = figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=INK, fontweight="bold")
+    if subtitle:
+        head.set_text(f"{title}\n")
+        figure.text(0.01, 1.0 - 0.46 / height_in, subtitle, ha="left", va="center", fontsize=9, color=MUTED)
+    return figure
+
+
+def dress(axes: Any, title: str, x_label: str, y_label: str) -> None:
+    """Equal scales, light grid, quiet frame."""
+    axes.set_title(title, fontsize=10, color=INK, loc="left")
+    axes.set_xlabel(x_label, fontsize=9, color=MUTED)
+    axes.set_ylabel(y_label, fontsize=9, color=MUTED)
+    axes.tick_params(labelsize=8, colors=MUTED)
+    axes.grid(True, color=GRID, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(GRID)
+
+
+def write(figure: Any, path: Path) -> Path:
+    """Write a PNG; its folder is made when it is missing.
+
+    Returns:
+        ``path``.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DPI)
+    return path
