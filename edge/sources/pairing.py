@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Puts the two radars' frames of one number together and closes the account of every frame that stays alone.
+
+Rules, for each radar by itself:
+
+* a number larger than the expected one: the numbers between are lost by GAP;
+* a number not larger than the one before (duplicate, reordered), or a time not later than that of the frame before:
+  the frame is lost by BACKWARDS_TIME;
+* the partner can no longer come, since the other radar is already past that number, or ``depth`` frames wait: UNPAIRED.
+
+The first frame of a radar sets its numbering; what was before it is nobody's loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from edge.accounting import FrameLedger
+from edge.errors import CaptureError
+from edge.frames import LossCause, RadarFrame, RadarId
+from edge.sources.base import Loss
+
+
+@dataclass(frozen=True, slots=True)
+class FramePair:
+    """Frames of one number.
+
+    Args:
+        number: of both.
+        horizontal, vertical: None for the radar that the rig does not have.
+    """
+
+    number: int
+    horizontal: RadarFrame | None
+    vertical: RadarFrame | None
+
+    @property
+    def frames(self) -> tuple[RadarFrame, ...]:
+        """The one or two frames."""
+        return tuple(frame for frame in (self.horizontal, self.vertical) if frame is not None)
+
+    @property
+    def t_ns(self) -> int:
+        """First chirp of the horizontal radar's burst; of the only radar's burst in a rig of one."""
+        return self.frames[0].t_first_chirp_ns
+
+
+@dataclass(slots=True)
+class _Lane:
+    ledger: FrameLedger
+    last_number: int | None = None
+    last_t_ns: int | None = None
+    waiting: dict[int, RadarFrame] = field(default_factory=dict)
+
+
+class FramePairer:
+    """Pairs frames by number; every frame that enters leaves in exactly one pair or one loss.
+
+    The pairer counts frames in and counts the losses that it reports or passes on; whoever takes a pair owes the
+    ledgers one ``ok`` or ``lost`` for each of its frames.
+
+    Args:
+        radars: radars of the rig, one or two.
+        ledgers: one for each radar; None: own ones.
+        depth: frames of one radar that may wait for the other.
+    """
+
+    def __init__(
+        self, radars: Iterable[RadarId], ledgers: Mapping[RadarId, FrameLedger] | None = None, depth: int = 8
+    ) -> None:
+        names = tuple(radars)
+        if not 1 <= len(names) <= 2 or len(set(names)) != len(names) or depth < 1:
+            raise CaptureError("frames cannot be paired", value=(names, depth), allowed="1 or 2 radars, depth >= 1")
+        self.ledgers: dict[RadarId, FrameLedger] = {n: ledgers[n] if ledgers else FrameLedger(n) for n in names}
+        self._lanes: dict[RadarId, _Lane] = {n: _Lane(self.ledgers[n]) for n in names}
+        self._depth = depth
+
+    def push(self, item: RadarFrame | Loss) -> list[FramePair | Loss]:
+        """Take one frame or one loss of the source.
+
+        Returns:
+            Pairs that became complete and losses that became certain, in order; the losses are in the ledgers already.
+        Raises:
+            CaptureError: a radar that the rig does not have.
+        """
+        lane = self._lanes.get(item.radar)
+        if lane is None:
+            raise CaptureError(
+                "frame of a radar that the rig does not have",
+                value=item.radar,
+                allowed=", ".join(self._lanes),
+                action="load the rig that the data were taken with",
+            )
+        out: list[FramePair | Loss] = []
+        if isinstance(item, Loss):
+            self._gap(lane, item.radar, item.number, item.t_ns, out)
+            lane.ledger.missing(item.cause, item.count)
+            lane.last_number = max(_or(lane.last_number, -1), item.number + item.count - 1)
+            out.append(item)
+        elif self._backwards(lane, item, out):
+            return out
+        else:
+            self._gap(lane, item.radar, item.number, item.t_first_chirp_ns, out)
+            lane.ledger.frame_in()
+            lane.last_number = item.number
+            lane.last_t_ns = item.t_first_chirp_ns
+            lane.waiting[item.number] = item
+        self._settle(item.radar, out)
+        return out
+
+    def flush(self) -> list[FramePair | Loss]:
+        """End of the source: every waiting frame is lost by UNPAIRED."""
+        out: list[FramePair | Loss] = []
+        for radar, lane in self._lanes.items():
+            while lane.waiting:
+                self._drop_oldest(radar, "the source ended before the other radar's frame came", out)
+        return out
+
+    def _backwards(self, lane: _Lane, frame: RadarFrame, out: list[FramePair | Loss]) -> bool:
+        number, t_ns = lane.last_number, lane.last_t_ns
+        if number is not None and frame.number <= number:
+            detail = f"number {frame.number} came after {number}: duplicate or reordered"
+        elif t_ns is not None and frame.t_first_chirp_ns <= t_ns:
+            detail = f"time stamp {(t_ns - frame.t_first_chirp_ns) / 1e6:.3f} ms before that of the frame before"
+            self._gap(lane, frame.radar, frame.number, frame.t_first_chirp_ns, out)
+            lane.last_number = frame.number
+            lane.last_t_ns = frame.t_first_chirp_ns
+        else:
+            return False
+        lane.ledger.missing(LossCause.BACKWARDS_TIME)
+        out.append(Loss(frame.radar, frame.number, LossCause.BACKWARDS_TIME, detail, frame.t_first_chirp_ns))
+        self._settle(frame.radar, out)
+        return True
+
+    def _gap(self, lane: _Lane, radar: RadarId, number: int, t_ns: int, out: list[FramePair | Loss]) -> None:
+        expected = number if lane.last_number is None else lane.last_number + 1
+        if number > expected:
+            count = number - expected
+            lane.ledger.missing(LossCause.GAP, count)
+            detail = f"numbers {expected}..{number - 1} never came"
+            out.append(Loss(radar, expected, LossCause.GAP, detail, t_ns, count))
+            lane.last_number = number - 1
+
+    def _settle(self, radar: RadarId, out: list[FramePair | Loss]) -> None:
+        """Emit what the latest item of ``radar`` decided."""
+        if len(self._lanes) == 1:
+            lane = self._lanes[radar]
+            for number, frame in lane.waiting.items():
+                out.append(FramePair(number, *((frame, None) if radar == "horizontal" else (None, frame))))
+            lane.waiting.clear()
+            return
+        horizontal, vertical = self._lanes["horizontal"], self._lanes["vertical"]
+        reached = min(_or(horizontal.last_number, -1), _or(vertical.last_number, -1))
+        decided = sorted(n for n in {*horizontal.waiting, *vertical.waiting} if n <= reached)
+        for number in decided:
+            if number in horizontal.waiting and number in vertical.waiting:
+                out.append(FramePair(number, horizontal.waiting.pop(number), vertical.waiting.pop(number)))
+            else:
+                alone: RadarId = "horizontal" if number in horizontal.waiting else "vertical"
+                self._drop_oldest(alone, "the other radar has no frame of this number", out)
+        while len(self._lanes[radar].waiting) > self._depth:
+            self._drop_oldest(radar, f"the other radar is more than {self._depth} frames behind", out)
+
+    def _drop_oldest(self, radar: RadarId, detail: str, out: list[FramePair | Loss]) -> None:
+        lane = self._lanes[radar]
+        frame = lane.waiting.pop(next(iter(lane.waiting)))
+        lane.ledger.lost(LossCause.UNPAIRED)
+        out.append(Loss(radar, frame.number, LossCause.UNPAIRED, detail, frame.t_first_chirp_ns))
+
+
+def _or(value: int | None, default: int) -> int:
+    return default if value is None else value
