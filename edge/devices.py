@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The radar chips: register steps, antennas' firing order and limits.
 
-Sources: TI Radar Interface Control Document 2.23, the chips' data sheets, TI mmWave SDK.
+Sources: TI Radar Interface Control Document 2.23, the chips' data sheets, TI mmWave SDK. Limits of the IWR6843 and of
+the AWR2944 are data sheet values that no board has confirmed.
 """
 
 from __future__ import annotations

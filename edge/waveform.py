@@ -23,6 +23,8 @@ from edge.frames import Float64, Layout
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 TIME_LSB_S = 10e-9
 FRAME_TIME_LSB_S = 5e-9
+TRIGGER_MARGIN_S = 200e-6
+"""External pulses must come after the programmed period is over: it is programmed shorter by this."""
 USABLE_IF_SHARE = 0.9
 """Complex1x: the IF filter passes 0.9 of the sampling rate (ICD)."""
 
@@ -273,9 +275,11 @@ class Schedule:
         )
         allowed = f"each at most once of {sorted(chip.firing_order)}"
         require(known, "schedule.transmitters", self.transmitters, allowed)
-        require(1 <= self.loops <= 255, "schedule.loops", self.loops, "1 to 255")
+        require(1 <= self.loops <= 2**16 - 1, "schedule.loops", self.loops, "1 to 65535")
+        longest_s = FRAME_TIME_LSB_S * (2**32 - 1)
+        period_s = self.frame_period_s
         require(
-            300e-6 <= self.frame_period_s <= 1.342, "schedule.frame_period_s", self.frame_period_s, "300 us to 1.342 s"
+            TRIGGER_MARGIN_S < period_s <= longest_s, "schedule.frame_period_s", period_s, f"200e-6 to {longest_s:g}"
         )
         require(self.iq_order in (None, "IQ", "QI"), "schedule.iq_order", self.iq_order, "IQ or QI")
         require(5e-6 <= self.packet_delay_s <= 500e-6, "schedule.packet_delay_s", self.packet_delay_s, "5 to 500 us")
@@ -299,7 +303,10 @@ class Schedule:
         Args:
             slave: of a slave chip, which waits for the master's pulse.
             frames: frames to send, 0: until stopped.
+        Returns:
+            With a hardware trigger the programmed period is 0.2 ms shorter than the frame period, which the pulses set.
         """
+        margin_s = TRIGGER_MARGIN_S if self.hardware_trigger else 0.0
         return FrameRegisters(
             reserved=0,
             first_chirp=0,
@@ -307,7 +314,7 @@ class Schedule:
             loops=self.loops,
             frames=frames,
             half_words=2 * self.profile.samples,
-            period=round(self.frame_period_s / FRAME_TIME_LSB_S),
+            period=round((self.frame_period_s - margin_s) / FRAME_TIME_LSB_S),
             trigger=2 if slave or self.hardware_trigger else 1,
             reserved_too=0,
             delay=0,
@@ -315,8 +322,8 @@ class Schedule:
 
     @property
     def frame_period_s_actual(self) -> float:
-        """Burst to burst as the register holds it, in 5 ns."""
-        return self.frame_registers().period * FRAME_TIME_LSB_S
+        """Burst to burst in whole steps of 5 ns."""
+        return round(self.frame_period_s / FRAME_TIME_LSB_S) * FRAME_TIME_LSB_S
 
     @property
     def burst_s(self) -> float:
