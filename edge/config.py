@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of every stage as frozen dataclasses: units in the names, defaults that work, values checked on construction.
+"""Settings of every stage as frozen dataclasses: units in the names, working defaults, values checked on construction.
 
 ``edge/rig.py`` fills them from TOML. A stage takes exactly its own group and nothing else.
 """
@@ -14,8 +14,10 @@ from edge.errors import ConfigError
 
 WindowName = Literal["rectangular", "hann"]
 CfarKind = Literal["ca", "os"]
+PointEncoding = Literal["f4", "f2", "i2"]
 WINDOWS: tuple[WindowName, ...] = ("rectangular", "hann")
 CFAR_KINDS: tuple[CfarKind, ...] = ("ca", "os")
+POINT_ENCODINGS: tuple[PointEncoding, ...] = ("f4", "f2", "i2")
 
 
 def require(condition: bool, key: str, value: object, allowed: str, action: str = "") -> None:
@@ -31,7 +33,7 @@ class HeatmapSettings:
     Args:
         range_window, angle_window: tapers before the range and the angle FFT.
         angle_bins: length of the angle FFT over the filled array (one period of the direction cosine).
-        focus: compensate the spherical wavefront at every range bin (simulator physics: needed below 2 D^2 / lambda = 14 m).
+        focus: compensate the spherical wavefront at every range bin (needed below 2 D^2 / lambda = 14 m).
         loops: loops summed coherently; 0 = as many as the ego speed allows, never more than it does.
         max_saturated_share: share of samples at the ADC's rails above which a frame is refused.
     """
@@ -99,7 +101,7 @@ class CfarSettings:
 
 @dataclass(frozen=True, slots=True)
 class AntennaSettings:
-    """One-way element pattern, loss in dB = loss_db * (angle / edge)^2, at most max_loss_db. No board has confirmed the level.
+    """One-way element pattern, loss in dB = loss_db * (angle / edge)^2, at most max_loss_db; no board has confirmed it.
 
     Args:
         along_edge_deg, along_loss_db: in the plane of the radar's own array.
@@ -171,7 +173,7 @@ class ObjectSettings:
         neighbour_m: points closer than this on the ground plane are of one object.
         core_points: a point with at least this many neighbours (itself included) grows its object.
         min_points: smaller clusters are clutter.
-        ground_clearance_m: points lower than this above ground take no part in clustering and join the nearest object after.
+        ground_clearance_m: points lower than this take no part in clustering; they join the nearest object after it.
         max_extent_m: longer clusters are not road users and are dropped (and counted).
         match_m: an object this close to one of the window before keeps its identity.
         forget_s: an identity unseen for longer is retired.
@@ -204,6 +206,12 @@ class CompletionSettings:
     intra_op_threads: int = 1
     min_confidence: float = 0.5
 
+    def __post_init__(self) -> None:
+        require(self.min_points >= 1, "completion.min_points", self.min_points, ">= 1")
+        require(self.max_points >= self.min_points, "completion.max_points", self.max_points, ">= min_points")
+        require(1 <= self.intra_op_threads <= 64, "completion.intra_op_threads", self.intra_op_threads, "1..64")
+        require(0 <= self.min_confidence <= 1, "completion.min_confidence", self.min_confidence, "0..1")
+
 
 @dataclass(frozen=True, slots=True)
 class StreamSettings:
@@ -212,10 +220,20 @@ class StreamSettings:
     Args:
         endpoints: ZeroMQ addresses to bind; only ipc:// and loopback are accepted.
         send_high_water_mark: messages queued per subscriber before the newest are dropped for it.
+        shape_encoding: number format of a shape's points: f4, f2 (0.5 mm within 2 m) or i2 (0.5 mm within 32 m).
     """
 
     endpoints: tuple[str, ...] = ("tcp://127.0.0.1:5600",)
     send_high_water_mark: int = 4
+    shape_encoding: PointEncoding = "f4"
+
+    def __post_init__(self) -> None:
+        require(len(self.endpoints) > 0, "stream.endpoints", self.endpoints, "at least one address")
+        require(
+            1 <= self.send_high_water_mark <= 1000, "stream.send_high_water_mark", self.send_high_water_mark, "1..1000"
+        )
+        known = ", ".join(POINT_ENCODINGS)
+        require(self.shape_encoding in POINT_ENCODINGS, "stream.shape_encoding", self.shape_encoding, known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +257,7 @@ class Mounting:
     Args:
         position_m: phase centre of its array in the rig frame (x, y, z).
         power_offset_db: added to the board's powers before association.
-        array_sign: +1 when antenna positions grow towards +y (horizontal) or +z (vertical), -1 when the board is turned round.
+        array_sign: +1 when antenna positions grow towards +y (horizontal) or +z (vertical), -1 when turned round.
         range_offset_m: added to the board's ranges (cables, delays).
     """
 

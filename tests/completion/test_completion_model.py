@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The completion model at run time: known answers, refusals, limits and what the confidence means."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge.completion.model import CompletionModel, confidence
+from edge.config import CompletionSettings
+from edge.errors import ConfigError, ModelError
+from edge.frames import Float32, ObjectCloud, Pose
+from edge.resources import shipped_dir
+
+SHIPPED = shipped_dir("models") / "default"
+SETTINGS = CompletionSettings()
+
+
+def cloud(points: Float32, frames: int = 60, complete: bool = True) -> ObjectCloud:
+    """An object cloud of these points."""
+    pose = Pose(9, np.array([1.0, 2.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0]))
+    return ObjectCloud(7, points, np.zeros(len(points), np.float32), pose, 5, 9, 3.0, frames, complete)
+
+
+@pytest.fixture(scope="module")
+def golden() -> Float32:
+    with np.load(SHIPPED / "golden.npz") as stored:
+        points: Float32 = stored["points"]
+    return points
+
+
+@pytest.fixture(scope="module")
+def model() -> CompletionModel:
+    return CompletionModel.load(SHIPPED, SETTINGS)
+
+
+def resigned(folder: Path, file: str, content: bytes) -> Path:
+    """The shipped folder with another file content and a manifest that vouches for it."""
+    shutil.copytree(SHIPPED, folder, dirs_exist_ok=True)
+    (folder / file).write_bytes(content)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for entry in manifest["files"]:
+        if entry["file"] == file:
+            entry |= {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder
+
+
+def test_shape_of_the_known_input(model: CompletionModel, golden: Float32) -> None:
+    shape = model.complete(cloud(golden))
+    assert shape is not None
+    assert shape.fine_m.shape == (16384, 3)
+    assert shape.coarse_m.shape == (1024, 3)
+    assert shape.fine_m.dtype == np.float32
+    assert shape.class_name == "car"
+    assert set(shape.class_probability) == {"car", "bicycle", "motorcycle", "pedestrian", "unknown"}
+    assert math.isclose(sum(shape.class_probability.values()), 1.0, abs_tol=1e-5)
+    assert shape.identity == 7
+    assert shape.model == hashlib.sha256((SHIPPED / "model.int8.onnx").read_bytes()).hexdigest()[:16]
+    assert shape.latency_us["nn"] > 0
+
+
+def test_the_shape_moves_with_its_input(model: CompletionModel, golden: Float32) -> None:
+    shift = np.array([100.0, -40.0, 0.0], np.float32)
+    here, there = model.complete(cloud(golden)), model.complete(cloud(golden + shift))
+    assert here is not None
+    assert there is not None
+    assert np.median(np.abs(there.coarse_m - shift - here.coarse_m)) < 0.01
+
+
+def test_too_few_points_give_no_shape(model: CompletionModel, golden: Float32) -> None:
+    assert model.complete(cloud(golden[:63])) is None
+    assert model.complete(cloud(golden[:64])) is not None
+
+
+def test_too_many_points_are_thinned_and_never_repeated(model: CompletionModel, golden: Float32) -> None:
+    many = np.random.default_rng(1).uniform(-1, 1, (5000, 3)).astype(np.float32)
+    seen: list[Float32] = []
+    run = model.run
+    model.run = lambda points_m: seen.append(points_m) or run(points_m)  # type: ignore[method-assign,func-returns-value]
+    try:
+        for points in (many, many, many[:2048], golden):
+            model.complete(cloud(points))
+    finally:
+        del model.run
+    assert len(seen[0]) == len(np.unique(seen[0], axis=0)) == 2048
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert set(map(bytes, seen[0])) <= set(map(bytes, many))
+    np.testing.assert_array_equal(seen[2], many[:2048])
+    np.testing.assert_array_equal(seen[3], golden)
+
+
+def test_confidence_follows_its_definition(golden: Float32) -> None:
+    full = cloud(golden)
+    assert confidence(0.9, 256, full) == pytest.approx(0.9)
+    assert confidence(0.9, 64, full) == pytest.approx(0.45)
+    assert confidence(0.9, 2048, cloud(golden, frames=15)) == pytest.approx(0.45)
+    assert confidence(0.9, 2048, cloud(golden, frames=600)) == pytest.approx(0.9)
+    assert confidence(0.9, 2048, cloud(golden, complete=False)) == pytest.approx(0.72)
+    assert confidence(1.0001, 2048, full) == 1.0
+
+
+def test_class_is_unknown_below_the_least_confidence(golden: Float32) -> None:
+    strict = CompletionModel.load(SHIPPED, replace(SETTINGS, min_confidence=0.99))
+    sure, unsure = strict.complete(cloud(golden)), strict.complete(cloud(golden, frames=30))
+    assert sure is not None
+    assert unsure is not None
+    assert (sure.class_name, unsure.class_name) == ("car", "unknown")
+    assert unsure.class_probability["car"] == sure.class_probability["car"]
+
+
+def test_not_finite_clouds_and_answers_are_withheld(model: CompletionModel, golden: Float32) -> None:
+    broken = golden.copy()
+    broken[3, 1] = np.nan
+    with pytest.raises(ModelError, match="object 7: its points are not finite"):
+        model.complete(cloud(broken))
+    with pytest.raises(ModelError, match="answer is not finite"):
+        model.complete(cloud(golden * np.float32(1e38)))
+
+
+def test_the_rig_must_be_one_of_the_manifest(model: CompletionModel) -> None:
+    assert model.valid_for("cascade_demo")
+    assert not model.valid_for("awr1843_pair")
+    with pytest.raises(ModelError, match="awr1843_pair") as caught:
+        CompletionModel.load(SHIPPED, SETTINGS, rig_name="awr1843_pair")
+    assert "cascade_pair" in caught.value.allowed
+
+
+@pytest.mark.parametrize(("low", "high"), [(32, 2048), (64, 4096)])
+def test_settings_may_not_widen_what_was_trained(low: int, high: int) -> None:
+    with pytest.raises(ConfigError, match=r"64\.\.2048"):
+        CompletionModel.load(SHIPPED, replace(SETTINGS, min_points=low, max_points=high))
+
+
+@pytest.mark.parametrize(
+    "values", [{"min_points": 0}, {"max_points": 8}, {"intra_op_threads": 0}, {"min_confidence": 2}]
+)
+def test_settings_are_checked(values: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(values))):
+        replace(SETTINGS, **values)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("file", ["model.onnx", "model.int8.onnx"])
+def test_wrong_weights_with_a_right_hash_are_refused(tmp_path: Path, file: str) -> None:
+    content = bytearray((SHIPPED / file).read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 200_000] = content[middle : middle + 200_000][::-1]
+    with pytest.raises(ModelError, match=r"known input|known answer|cannot load|failed") as caught:
+        CompletionModel.load(resigned(tmp_path, file, bytes(content)), SETTINGS, file=file)
+    assert caught.value.exit_code == 6
+
+
+def test_measured_and_allowed_difference_are_named(tmp_path: Path) -> None:
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    with np.load(SHIPPED / "golden.npz") as stored:
+        answers = dict(stored)
+    answers["model.onnx:coarse"][5, 2] += np.float32(0.25)
+    np.savez(tmp_path / "golden.npz", **answers)
+    assert CompletionModel.load(tmp_path, SETTINGS).file == "model.int8.onnx"
+    with pytest.raises(ModelError, match="coarse of the known input") as caught:
+        CompletionModel.load(tmp_path, SETTINGS, file="model.onnx")
+    assert caught.value.value == "0.25 m"
+    assert caught.value.allowed == "at most 0.001 m"
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(18), b"\x93NUMPY\x01\x00"])
+def test_no_known_answer_is_a_refusal(tmp_path: Path, content: bytes) -> None:
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "golden.npz").write_bytes(content)
+    with pytest.raises(ModelError, match=r"golden\.npz"):
+        CompletionModel.load(tmp_path, SETTINGS)
+
+
+def test_no_onnx_file_is_a_refusal(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="cannot load"):
+        CompletionModel.load(resigned(tmp_path, "model.int8.onnx", b"no protobuf"), SETTINGS)
+    with pytest.raises(ModelError, match="no such model file"):
+        CompletionModel.load(SHIPPED, SETTINGS, file="other.onnx")
+
+
+def test_nothing_is_written_beside_the_model(tmp_path: Path) -> None:
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    CompletionModel.load(tmp_path, SETTINGS)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
