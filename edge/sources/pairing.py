@@ -36,14 +36,14 @@ class FramePair:
     vertical: RadarFrame | None
 
     @property
-    def frames(self) -> tuple[RadarFrame, ...]:
-        """The one or two frames."""
-        return tuple(frame for frame in (self.horizontal, self.vertical) if frame is not None)
+    def frames(self) -> dict[RadarId, RadarFrame]:
+        """The one or two frames by radar, the horizontal one first."""
+        return {frame.radar: frame for frame in (self.horizontal, self.vertical) if frame is not None}
 
     @property
     def t_ns(self) -> int:
         """First chirp of the horizontal radar's burst; of the only radar's burst in a rig of one."""
-        return self.frames[0].t_first_chirp_ns
+        return next(iter(self.frames.values())).t_first_chirp_ns
 
 
 @dataclass(slots=True)
@@ -57,8 +57,8 @@ class _Lane:
 class FramePairer:
     """Pairs frames by number; every frame that enters leaves in exactly one pair or one loss.
 
-    The pairer counts frames in and counts the losses that it reports or passes on; whoever takes a pair owes the
-    ledgers one ``ok`` or ``lost`` for each of its frames.
+    The pairer keeps the ledgers up to date: it counts frames in, and every loss that it returns is counted already.
+    Whoever takes a pair owes the ledgers one ``ok`` or ``lost`` for each of its frames.
 
     Args:
         radars: radars of the rig, one or two.
@@ -76,11 +76,11 @@ class FramePairer:
         self._lanes: dict[RadarId, _Lane] = {n: _Lane(self.ledgers[n]) for n in names}
         self._depth = depth
 
-    def push(self, item: RadarFrame | Loss) -> list[FramePair | Loss]:
+    def add(self, item: RadarFrame | Loss) -> tuple[list[FramePair], list[Loss]]:
         """Take one frame or one loss of the source.
 
         Returns:
-            Pairs that became complete and losses that became certain, in order; the losses are in the ledgers already.
+            Pairs that became complete, by number, and losses that became certain, ``item`` among them when it is one.
         Raises:
             CaptureError: a radar that the rig does not have.
         """
@@ -92,81 +92,77 @@ class FramePairer:
                 allowed=", ".join(self._lanes),
                 action="load the rig that the data were taken with",
             )
-        out: list[FramePair | Loss] = []
+        losses: list[Loss] = []
         if isinstance(item, Loss):
-            self._gap(lane, item.radar, item.number, item.t_ns, out)
+            self._gap(lane, item.radar, item.number, item.t_ns, losses)
             lane.ledger.missing(item.cause, item.count)
             lane.last_number = max(_or(lane.last_number, -1), item.number + item.count - 1)
-            out.append(item)
-        elif self._backwards(lane, item, out):
-            return out
-        else:
-            self._gap(lane, item.radar, item.number, item.t_first_chirp_ns, out)
+            losses.append(item)
+        elif not self._goes_backwards(lane, item, losses):
+            self._gap(lane, item.radar, item.number, item.t_first_chirp_ns, losses)
             lane.ledger.frame_in()
             lane.last_number = item.number
             lane.last_t_ns = item.t_first_chirp_ns
             lane.waiting[item.number] = item
-        self._settle(item.radar, out)
-        return out
+        return self._settle(item.radar, losses), losses
 
-    def flush(self) -> list[FramePair | Loss]:
+    def flush(self) -> list[Loss]:
         """End of the source: every waiting frame is lost by UNPAIRED."""
-        out: list[FramePair | Loss] = []
+        losses: list[Loss] = []
         for radar, lane in self._lanes.items():
             while lane.waiting:
-                self._drop_oldest(radar, "the source ended before the other radar's frame came", out)
-        return out
+                self._drop_oldest(radar, "the source ended before the other radar's frame came", losses)
+        return losses
 
-    def _backwards(self, lane: _Lane, frame: RadarFrame, out: list[FramePair | Loss]) -> bool:
+    def _goes_backwards(self, lane: _Lane, frame: RadarFrame, losses: list[Loss]) -> bool:
         number, t_ns = lane.last_number, lane.last_t_ns
         if number is not None and frame.number <= number:
             detail = f"number {frame.number} came after {number}: duplicate or reordered"
         elif t_ns is not None and frame.t_first_chirp_ns <= t_ns:
             detail = f"time stamp {(t_ns - frame.t_first_chirp_ns) / 1e6:.3f} ms before that of the frame before"
-            self._gap(lane, frame.radar, frame.number, frame.t_first_chirp_ns, out)
+            self._gap(lane, frame.radar, frame.number, frame.t_first_chirp_ns, losses)
             lane.last_number = frame.number
             lane.last_t_ns = frame.t_first_chirp_ns
         else:
             return False
         lane.ledger.missing(LossCause.BACKWARDS_TIME)
-        out.append(Loss(frame.radar, frame.number, LossCause.BACKWARDS_TIME, detail, frame.t_first_chirp_ns))
-        self._settle(frame.radar, out)
+        losses.append(Loss(frame.radar, frame.number, LossCause.BACKWARDS_TIME, detail, frame.t_first_chirp_ns))
         return True
 
-    def _gap(self, lane: _Lane, radar: RadarId, number: int, t_ns: int, out: list[FramePair | Loss]) -> None:
+    def _gap(self, lane: _Lane, radar: RadarId, number: int, t_ns: int, losses: list[Loss]) -> None:
         expected = number if lane.last_number is None else lane.last_number + 1
         if number > expected:
             count = number - expected
             lane.ledger.missing(LossCause.GAP, count)
             detail = f"numbers {expected}..{number - 1} never came"
-            out.append(Loss(radar, expected, LossCause.GAP, detail, t_ns, count))
+            losses.append(Loss(radar, expected, LossCause.GAP, detail, t_ns, count))
             lane.last_number = number - 1
 
-    def _settle(self, radar: RadarId, out: list[FramePair | Loss]) -> None:
-        """Emit what the latest item of ``radar`` decided."""
+    def _settle(self, radar: RadarId, losses: list[Loss]) -> list[FramePair]:
+        """Pairs and losses that the latest item of ``radar`` decided."""
         if len(self._lanes) == 1:
-            lane = self._lanes[radar]
-            for number, frame in lane.waiting.items():
-                out.append(FramePair(number, *((frame, None) if radar == "horizontal" else (None, frame))))
-            lane.waiting.clear()
-            return
+            alone = list(self._lanes[radar].waiting.values())
+            self._lanes[radar].waiting.clear()
+            return [FramePair(f.number, *((f, None) if radar == "horizontal" else (None, f))) for f in alone]
+        pairs: list[FramePair] = []
         horizontal, vertical = self._lanes["horizontal"], self._lanes["vertical"]
         reached = min(_or(horizontal.last_number, -1), _or(vertical.last_number, -1))
         decided = sorted(n for n in {*horizontal.waiting, *vertical.waiting} if n <= reached)
         for number in decided:
             if number in horizontal.waiting and number in vertical.waiting:
-                out.append(FramePair(number, horizontal.waiting.pop(number), vertical.waiting.pop(number)))
+                pairs.append(FramePair(number, horizontal.waiting.pop(number), vertical.waiting.pop(number)))
             else:
-                alone: RadarId = "horizontal" if number in horizontal.waiting else "vertical"
-                self._drop_oldest(alone, "the other radar has no frame of this number", out)
+                single: RadarId = "horizontal" if number in horizontal.waiting else "vertical"
+                self._drop_oldest(single, "the other radar has no frame of this number", losses)
         while len(self._lanes[radar].waiting) > self._depth:
-            self._drop_oldest(radar, f"the other radar is more than {self._depth} frames behind", out)
+            self._drop_oldest(radar, f"the other radar is more than {self._depth} frames behind", losses)
+        return pairs
 
-    def _drop_oldest(self, radar: RadarId, detail: str, out: list[FramePair | Loss]) -> None:
+    def _drop_oldest(self, radar: RadarId, detail: str, losses: list[Loss]) -> None:
         lane = self._lanes[radar]
         frame = lane.waiting.pop(next(iter(lane.waiting)))
         lane.ledger.lost(LossCause.UNPAIRED)
-        out.append(Loss(radar, frame.number, LossCause.UNPAIRED, detail, frame.t_first_chirp_ns))
+        losses.append(Loss(radar, frame.number, LossCause.UNPAIRED, detail, frame.t_first_chirp_ns))
 
 
 def _or(value: int | None, default: int) -> int:
