@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from edge.config import require
 from edge.errors import ConfigError
 from edge.waveform import FRAME_TIME_LSB_S, ChirpProfile, Schedule
 
@@ -79,8 +80,8 @@ def _rule(
     """``measured <= limit``, or ``measured >= limit`` when ``least``."""
     excess = limit - measured if least else measured - limit
     passed = bool(excess <= ROUNDING * max(abs(limit), abs(measured)))
-    side = "below" if least else "above"
-    message = "" if passed else f"{name} {measured:.6g} {unit}".rstrip() + f" is {side} {limit:.6g}: {advice}"
+    here, there = (f"{value:.6g} {unit}".rstrip() for value in (measured, limit))
+    message = "" if passed else f"{name} {here} is {'below' if least else 'above'} {there}: {advice}"
     return Constraint(name, formula, limit, measured, unit, passed, message, "warning" if warn else "error")
 
 
@@ -198,7 +199,10 @@ def guard_s(drift_s_per_s: float = DRIFT_S_PER_S, rearm_s: float = REARM_S) -> f
     Args:
         drift_s_per_s: of the two boards' clocks against each other; 40e-6 is two crystals of +-20 ppm.
         rearm_s: time between re-arms; 0: no allowance for drift.
+    Raises:
+        ConfigError: a negative argument.
     """
+    require(drift_s_per_s >= 0.0 and rearm_s >= 0.0, "interleave drift, rearm", (drift_s_per_s, rearm_s), ">= 0")
     return GUARD_S + drift_s_per_s * rearm_s
 
 
@@ -226,18 +230,15 @@ def check_interleave(
     bins = a.profile.range_bin_m, b.profile.range_bin_m
     slopes = a.profile.slope_hz_per_s_actual, b.profile.slope_hz_per_s_actual
     formula = f"burst1 + burst2 + 2 guard <= T, guard = 0.5 ms + {drift_s_per_s * 1e6:g} us/s x {rearm_s:g} s"
+    unequal = 100 * abs(bins[0] - bins[1]) / min(bins)
+    same_chirp = "give both radars the same slope, samples and sample rate"
+    crossing = "ramps that cross let one radar into the other's IF band; give both the same slope"
+    apart = abs(slopes[0] - slopes[1]) / 1e12
     return [
         _rule("interleave", formula, needed, period, "ms", "fewer loops, a longer period or re-arming more often"),
         _rule("equal periods", "|T1 - T2| < 5 ns", 5.0 * steps, 0.0, "ns", "give both radars the same period"),
-        _rule(
-            *("equal range bins", "|dR1 - dR2| <= 1 % of the smaller", 100 * abs(bins[0] - bins[1]) / min(bins)),
-            *(100 * RANGE_BIN_TOLERANCE, "%", "give both radars the same slope, samples and sample rate"),
-        ),
-        _rule(
-            *("equal slopes", "S1 = S2", abs(slopes[0] - slopes[1]) / 1e12, 0.0, "MHz/us"),
-            "ramps that cross let one radar into the other's IF band; give both the same slope",
-            warn=True,
-        ),
+        _rule("equal range bins", "|dR1 - dR2| <= 1 %", unequal, 100 * RANGE_BIN_TOLERANCE, "%", same_chirp),
+        _rule("equal slopes", "S1 = S2", apart, 0.0, "MHz/us", crossing, warn=True),
     ]
 
 
