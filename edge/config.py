@@ -187,6 +187,15 @@ class ObjectSettings:
     match_m: float = 1.5
     forget_s: float = 5.0
 
+    def __post_init__(self) -> None:
+        require(0 < self.neighbour_m <= 10, "objects.neighbour_m", self.neighbour_m, "0 < neighbour_m <= 10")
+        require(self.core_points >= 1, "objects.core_points", self.core_points, ">= 1")
+        require(self.min_points >= 1, "objects.min_points", self.min_points, ">= 1")
+        require(0 <= self.ground_clearance_m <= 1, "objects.ground_clearance_m", self.ground_clearance_m, "0..1")
+        require(self.max_extent_m > 0, "objects.max_extent_m", self.max_extent_m, "> 0")
+        require(self.match_m >= 0, "objects.match_m", self.match_m, ">= 0")
+        require(0 <= self.forget_s <= 3600, "objects.forget_s", self.forget_s, "0..3600")
+
 
 @dataclass(frozen=True, slots=True)
 class CompletionSettings:
