@@ -127,7 +127,8 @@ class ChirpProfile:
         }
         for key, (low, high) in limits.items():
             value = getattr(self, key)
-            require(low <= value <= high, f"profile.{key}", value, f"{low:g} to {high:g}")
+            inside = low - 1e-9 * abs(low) <= value <= high + 1e-9 * abs(high)
+            require(inside, f"profile.{key}", value, f"{low:g} to {high:g}")
         whole = abs(self.sample_rate_hz / 1e3 - round(self.sample_rate_hz / 1e3)) < 1e-6
         require(whole, "profile.sample_rate_hz", self.sample_rate_hz, "a whole number of kHz, as the register holds it")
         require(self.rx_gain_db % 2 == 0, "profile.rx_gain_db", self.rx_gain_db, "an even number")
@@ -282,7 +283,12 @@ class Schedule:
             TRIGGER_MARGIN_S < period_s <= longest_s, "schedule.frame_period_s", period_s, f"200e-6 to {longest_s:g}"
         )
         require(self.iq_order in (None, "IQ", "QI"), "schedule.iq_order", self.iq_order, "IQ or QI")
-        require(5e-6 <= self.packet_delay_s <= 500e-6, "schedule.packet_delay_s", self.packet_delay_s, "5 to 500 us")
+        require(
+            5e-6 <= round(self.packet_delay_s, 9) <= 500e-6,
+            "schedule.packet_delay_s",
+            self.packet_delay_s,
+            "5 to 500 us",
+        )
         require(self.lvds_lanes in (2, 4), "schedule.lvds_lanes", self.lvds_lanes, "2 or 4")
         cascade_only = self.is_cascade or not self.packed_12_bit
         require(cascade_only, "schedule.packed_12_bit", self.packed_12_bit, "true for the cascade's recorder only")
