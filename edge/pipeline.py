@@ -16,7 +16,7 @@ from edge.completion.model import CompletionModel
 from edge.dsp.checks import FrameRejected
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
-from edge.errors import CaptureError, ModelError, PoseError
+from edge.errors import ModelError, PoseError
 from edge.frames import (
     RADARS,
     Detections,
@@ -120,34 +120,38 @@ class Pipeline:
         settings = rig.settings
         self.rig, self.sinks, self._completion = rig, list(sinks), completion
         self.radars: tuple[RadarId, ...] = tuple(radar for radar in RADARS if radar in rig.radars)
-        self.ledgers: dict[RadarId, FrameLedger] = {radar: FrameLedger(radar) for radar in self.radars}
         self.times, self.faults = StageTimes(), Faults()
+        self._pairer = FramePairer(self.radars)
+        self.ledgers: dict[RadarId, FrameLedger] = self._pairer.ledgers
         self._imagers = {r: Imager(rig.radars[r], settings.heatmap, settings.antenna) for r in self.radars}
         self._detectors = {r: Detector(rig.radars[r], settings.cfar) for r in self.radars}
-        self._pairer = FramePairer(self.radars)
         self._track = PoseTrack(settings.fusion.max_pose_gap_s)
         self._associator = Associator(rig) if len(self.radars) == len(RADARS) else None
         self._fusion = TemporalFusion(settings.fusion)
         self._tracker = ObjectTracker(settings.objects, rig.geometry)
         self._waiting: deque[FramePair] = deque()
+        self._newest_pose_ns: int | None = None
 
     def feed(self, item: RadarFrame | Pose | Loss) -> None:
-        """Take the next frame, pose or loss of a source, in the source's order."""
+        """Take the next frame, pose or loss of a source, in the source's order.
+
+        Raises:
+            CaptureError: a radar that the rig does not have, or another layout than its schedule's.
+        """
         if isinstance(item, Pose):
             self._add_pose(item)
-        elif isinstance(item, Loss):
-            self._lose_at_source(item)
         else:
-            self._add_frame(item)
+            pairs, losses = self._pairer.add(item)
+            self._note(losses)
+            self._waiting.extend(pairs)
         self._work()
 
     def finish(self) -> None:
         """The source has ended: what still waits is processed or counted, the last window is closed."""
-        for loss in self._pairer.flush():
-            self._lose(loss)
+        self._note(self._pairer.flush())
         self._work()
         while self._waiting:
-            self._lose_pair(self._waiting.popleft(), LossCause.NO_POSE)
+            self._give_up(self._waiting.popleft())
         self._close(self._fusion.flush())
         for ledger in self.ledgers.values():
             ledger.check()
@@ -155,33 +159,21 @@ class Pipeline:
     def _add_pose(self, pose: Pose) -> None:
         try:
             self._track.add(pose)
+            self._newest_pose_ns = pose.t_ns
         except PoseError as error:
             self.faults.poses_refused += 1
             self.faults.last = str(error)
 
-    def _add_frame(self, frame: RadarFrame) -> None:
-        if frame.radar not in self.ledgers:
-            raise CaptureError(
-                f"frame {frame.number} comes from a radar that rig {self.rig.name} does not have",
-                value=frame.radar,
-                allowed=", ".join(self.radars),
-                action="play the recording with the rig that it was made with",
-            )
-        self.ledgers[frame.radar].frame_in()
-        pairs, losses = self._pairer.add(frame)
-        for loss in losses:
-            self._lose(loss)
-        self._waiting.extend(pairs)
+    def _note(self, losses: Sequence[Loss]) -> None:
+        """Remember the newest loss in words; the pairer has counted it."""
+        if losses:
+            last = losses[-1]
+            self.faults.last = f"{last.radar} frame {last.number}: {last.cause.value}: {last.detail}"
 
-    def _lose_at_source(self, loss: Loss) -> None:
-        """A frame that the source knows of but could not deliver comes in and is lost at once."""
-        if loss.radar in self.ledgers:
-            self.ledgers[loss.radar].frame_in()
-            self._lose(loss)
-
-    def _lose(self, loss: Loss) -> None:
-        self.ledgers[loss.radar].lost(loss.cause)
-        self.faults.last = loss.detail or self.faults.last
+    def _give_up(self, pair: FramePair) -> None:
+        """No pose for this pair."""
+        self._lose_pair(pair, LossCause.NO_POSE)
+        self.faults.last = f"frame {pair.number}: {self._track.why_none(pair.t_ns)}"
 
     def _lose_pair(self, pair: FramePair, cause: LossCause) -> None:
         for radar in pair.frames:
@@ -193,10 +185,10 @@ class Pipeline:
             pair = self._waiting[0]
             pose = self._track.at(pair.t_ns)
             if pose is None and self._associator is not None:
-                too_many = len(self._waiting) > MAX_WAITING_PAIRS
-                if self._track.may_still_come(pair.t_ns) and not too_many:
+                may_still_come = self._newest_pose_ns is None or pair.t_ns > self._newest_pose_ns
+                if may_still_come and len(self._waiting) <= MAX_WAITING_PAIRS:
                     return
-                self._lose_pair(self._waiting.popleft(), LossCause.NO_POSE)
+                self._give_up(self._waiting.popleft())
                 continue
             self._waiting.popleft()
             self._process(pair, pose)

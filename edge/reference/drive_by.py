@@ -7,15 +7,19 @@ coupling or polarisation. Scatterers are isotropic except that they fade with th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import AntennaSettings, RigGeometry, require
-from edge.frames import RADARS, Float64, Pose, RadarFrame
-from edge.reference.point_targets import Radar, make_frame
+from edge.frames import RADARS, Float64, Pose, RadarFrame, RadarId
+from edge.reference.point_targets import make_frame
+
+if TYPE_CHECKING:
+    from edge.rig import Radar
 
 OCCLUSION_DEPTH_M = 0.15
 """A point is hidden when the surface in its direction is nearer by more than this."""
@@ -147,50 +151,56 @@ def place(vertices_m: Float64, scene: DriveBy, yaw_deg: float = 0.0) -> Float64:
     return np.asarray(turned + shift_m)
 
 
-def drive_by(
-    radars: dict[str, Radar],
-    geometry: RigGeometry,
-    antenna: AntennaSettings,
-    vertices_m: Float64,
-    faces: NDArray[np.int32],
-    scene: DriveBy,
-) -> Iterator[RadarFrame]:
-    """Raw frames of the rig driving past an object, in time order.
+class DriveByScene:
+    """The rig drives past an object; any frame of any radar can be asked for, always with the same samples.
 
     Args:
         radars: radar id -> board; the vertical one fires half a period after the horizontal one.
         geometry: height and yaw of the rig.
         antenna: element pattern, applied to the direction of each scatterer from the rig.
         vertices_m, faces: the object in the odometry frame, see ``place``.
-        scene: track, timing, levels.
+        settings: track, timing, levels.
     """
-    rng = np.random.default_rng(scene.seed)
-    surface = sample_surface(vertices_m, faces, SURFACE_POINTS, rng)
-    scatterers = sample_surface(vertices_m, faces, scene.scatterers, rng)
-    strength = rng.exponential(1.0, scene.scatterers) ** 0.5 * np.exp(2j * np.pi * rng.random(scene.scatterers))
-    yaw_rad = np.radians(geometry.yaw_deg)
-    axes = np.array(
-        [[np.cos(yaw_rad), np.sin(yaw_rad), 0.0], [-np.sin(yaw_rad), np.cos(yaw_rad), 0.0], [0.0, 0.0, 1.0]]
-    )
-    velocity_rig_m_s = axes @ np.array([scene.speed_m_s, 0.0, 0.0])
-    level_lsb = 10.0 ** (scene.reference_power_db / 20.0)
-    for number in range(scene.frames):
-        for radar in (name for name in RADARS if name in radars):
-            delay_s = 0.5 * scene.frame_period_s if radar == "vertical" and len(radars) > 1 else 0.0
-            time_s = number * scene.frame_period_s + delay_s
-            eye_m = np.array([scene.speed_m_s * time_s, 0.0, geometry.height_m])
-            seen = visible(scatterers, surface, eye_m)
-            rig_m = (scatterers.points_m[seen] - eye_m) @ axes.T
-            range_m = np.linalg.norm(rig_m, axis=1)
-            towards = (scatterers.points_m[seen] - eye_m) / range_m[:, None]
-            incidence = np.abs(np.einsum("ij,ij->i", towards, scatterers.normals[seen]))
-            gain = antenna_amplitude(radar, rig_m / range_m[:, None], antenna)
-            amplitude = level_lsb * strength[seen] * incidence * gain / range_m**2
-            instant_ns = EPOCH_NS + round(time_s * 1e9)
-            yield make_frame(
-                *(radars[radar], rig_m, amplitude, number, instant_ns, velocity_rig_m_s),
-                *(scene.noise_lsb, rng),
-            )
+
+    def __init__(
+        self,
+        radars: Mapping[RadarId, Radar],
+        geometry: RigGeometry,
+        antenna: AntennaSettings,
+        vertices_m: Float64,
+        faces: NDArray[np.int32],
+        settings: DriveBy,
+    ) -> None:
+        self.radars, self.settings, self._antenna, self._height_m = dict(radars), settings, antenna, geometry.height_m
+        rng = np.random.default_rng(settings.seed)
+        self._surface = sample_surface(vertices_m, faces, SURFACE_POINTS, rng)
+        self._scatterers = sample_surface(vertices_m, faces, settings.scatterers, rng)
+        phase = np.exp(2j * np.pi * rng.random(settings.scatterers))
+        level_lsb = 10.0 ** (settings.reference_power_db / 20.0)
+        self._strength = level_lsb * np.sqrt(rng.exponential(1.0, settings.scatterers)) * phase
+        c, s = np.cos(np.radians(geometry.yaw_deg)), np.sin(np.radians(geometry.yaw_deg))
+        self._axes = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        """Rows: the rig's x, y, z in the odometry frame."""
+        self.velocity_rig_m_s = self._axes @ np.array([settings.speed_m_s, 0.0, 0.0])
+
+    def frame(self, radar: RadarId, number: int) -> RadarFrame:
+        """Raw frame ``number`` of one radar."""
+        settings, points = self.settings, self._scatterers
+        delay_s = 0.5 * settings.frame_period_s if radar == "vertical" and len(self.radars) > 1 else 0.0
+        time_s = number * settings.frame_period_s + delay_s
+        eye_m = np.array([settings.speed_m_s * time_s, 0.0, self._height_m])
+        seen = visible(points, self._surface, eye_m)
+        offset_m = points.points_m[seen] - eye_m
+        range_m = np.linalg.norm(offset_m, axis=1)
+        towards = offset_m / range_m[:, None]
+        incidence = np.abs(np.einsum("ij,ij->i", towards, points.normals[seen]))
+        gain = antenna_amplitude(radar, towards @ self._axes.T, self._antenna)
+        amplitude = self._strength[seen] * incidence * gain / range_m**2
+        return make_frame(
+            *(self.radars[radar], offset_m @ self._axes.T, amplitude, number, EPOCH_NS + round(time_s * 1e9)),
+            *(self.velocity_rig_m_s, settings.noise_lsb),
+            rng=np.random.default_rng((settings.seed, number, RADARS.index(radar))),
+        )
 
 
 def antenna_amplitude(radar: str, direction: Float64, antenna: AntennaSettings) -> Float64:

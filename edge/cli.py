@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``rfconstruct`` command: finds the verb, imports only its module, turns errors into exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+
+from edge.errors import ExitCode, RfconstructError
+
+VERBS = {
+    "demo": "drive past one object (simulated point scatterers), publish its shape, draw pictures",
+    "replay": "play a recording through the whole pipeline and publish what comes out",
+    "listen": "print what a running pipeline publishes",
+    "import": "turn a TI capture into a recording, or a TI calibration into ours",
+    "info": "describe a recording, a rig or a model; rigs with every hardware rule",
+    "bench": "time every stage beside a named peer in the same process",
+}
+INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point.
+
+    Args:
+        argv: arguments without the program's name; None: those of the process.
+    Returns:
+        Exit code: 0 ok, 1 failure, 2 usage, 3 degraded, 4 no hardware, 5 bad configuration, 6 bad model.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(overview())
+        return ExitCode.OK if arguments else ExitCode.USAGE
+    if arguments[0] in ("-V", "--version"):
+        print(f"rfconstruct {version()}")
+        return ExitCode.OK
+    verb, rest = arguments[0], arguments[1:]
+    if verb not in VERBS:
+        close = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        print(f"rfconstruct: unknown command {verb!r}{hint}\ncommands: {', '.join(VERBS)}", file=sys.stderr)
+        return ExitCode.USAGE
+    return _run(verb, rest)
+
+
+def overview() -> str:
+    """Help that fits a screen."""
+    lines = ["usage: rfconstruct COMMAND [options]", "", "commands:"]
+    lines += [f"  {verb:<8} {text}" for verb, text in VERBS.items()]
+    lines += ["", "rfconstruct COMMAND --help shows the options of one command."]
+    lines += ["exit codes: 0 ok, 1 failure, 2 usage, 3 degraded, 4 no hardware, 5 bad configuration, 6 bad model"]
+    return "\n".join(lines)
+
+
+def version() -> str:
+    """Version of the installed distribution."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("rfconstruct")
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _run(verb: str, rest: Sequence[str]) -> int:
+    module = importlib.import_module(f"edge.commands.{verb}_command")
+    parser = argparse.ArgumentParser(prog=f"rfconstruct {verb}", description=f"{VERBS[verb]}.")
+    module.add_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="machine-readable output on stdout")
+    args = parser.parse_args(rest)
+    try:
+        return int(module.run(args))
+    except RfconstructError as error:
+        return _report(verb, error, args.json)
+    except KeyboardInterrupt:
+        print(f"rfconstruct {verb}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ExitCode.OK
+
+
+def _report(verb: str, error: RfconstructError, as_json: bool) -> int:
+    if as_json:
+        content = {"what": error.what, "value": error.value, "allowed": error.allowed, "action": error.action}
+        print(json.dumps({"error": content, "exit_code": int(error.exit_code)}, default=str))
+    else:
+        print(f"rfconstruct {verb}: {error}", file=sys.stderr)
+    return int(error.exit_code)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

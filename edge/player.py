@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plays a source through the pipeline at a chosen speed, with a progress bar on a terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from edge.frames import Pose, RadarFrame
+from edge.pipeline import Pipeline
+from edge.sources.base import Loss
+
+LONGEST_SLEEP_S = 60.0
+"""A jump of the recorded clock beyond this is not waited for."""
+
+
+class Pace:
+    """Waits until an item is due.
+
+    Args:
+        speed: recorded seconds per second; 0 plays as fast as it goes.
+    """
+
+    def __init__(self, speed: float) -> None:
+        self._speed = speed
+        self._start: tuple[int, int] | None = None
+        self.late_ns = 0
+        """How long ago the last item was due."""
+
+    def wait(self, t_ns: int) -> None:
+        """Sleep until recorded instant ``t_ns`` is due."""
+        if self._speed <= 0:
+            return
+        now_ns = time.monotonic_ns()
+        if self._start is None:
+            self._start = (t_ns, now_ns)
+        due_ns = self._start[1] + round((t_ns - self._start[0]) / self._speed)
+        ahead_s = (due_ns - now_ns) / 1e9
+        self.late_ns = max(0, now_ns - due_ns)
+        if ahead_s > LONGEST_SLEEP_S:
+            self._start = (t_ns, now_ns)
+        elif ahead_s > 0:
+            time.sleep(ahead_s)
+
+
+def play(
+    source: Iterable[RadarFrame | Pose | Loss],
+    pipeline: Pipeline,
+    speed: float,
+    total: int | None = None,
+    show_progress: bool = True,
+) -> None:
+    """Feed everything a source has, then finish the pipeline.
+
+    Args:
+        source: frames, poses and losses in time order.
+        pipeline: where they go.
+        speed: recorded seconds per second; 0 plays as fast as it goes.
+        total: radar frames the source will give, when it knows.
+        show_progress: draw a bar when stderr is a terminal.
+    """
+    pace = Pace(speed)
+    with _progress(total, show_progress) as bar:
+        for item in source:
+            if not isinstance(item, Loss):
+                pace.wait(item.t_ns if isinstance(item, Pose) else item.t_first_chirp_ns)
+            pipeline.feed(item)
+            if isinstance(item, RadarFrame):
+                bar.update(1)
+        pipeline.finish()
+
+
+def _progress(total: int | None, wanted: bool) -> Any:
+    from tqdm import tqdm
+
+    hidden = not wanted or not sys.stderr.isatty()
+    return tqdm(total=total, unit="frame", desc="playing", disable=hidden, leave=False, dynamic_ncols=True)
