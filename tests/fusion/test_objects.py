@@ -26,10 +26,8 @@ def yaw(angle_rad: float) -> Float64:
     return np.array([0.0, 0.0, np.sin(angle_rad / 2), np.cos(angle_rad / 2)])
 
 
-def box(
-    x_m: float, y_m: float, size_m: tuple[float, float, float], pitch_m: float = 0.1, foot_m: float = 0.2
-) -> Float64:
-    """Lattice of points that fills a box on the ground, in odom; the middle of its plan is (x_m, y_m)."""
+def box(x_m: float, y_m: float, size_m: tuple[float, float, float], ground_m: float = 0.0) -> Float64:
+    """Lattice of points in odom that fills a box from 0.2 m above the ground up; its plan is centred on (x_m, y_m)."""
     lengths = (np.linspace(-s / 2, s / 2, round(s / 0.1) + 1) for s in size_m[:2])
     grid = np.meshgrid(*lengths, np.linspace(0.2, size_m[2], 6), indexing="ij")
     return np.stack([axis.ravel() for axis in grid], axis=1) + np.array([x_m, y_m, ground_m])
