@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels that pair both radars' detections and place the pairs in space.
+
+Detections of both radars share one index: those of the horizontal radar that are kept come first, ``split`` of them,
+then the vertical radar's. All arithmetic is float64 and unreordered, so that no decision depends on the machine.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import boolean, float32, float64, int64, njit, types
+
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+
+INVALID, FOV, BINS, UNMATCHED, POWER, PAIRS, GEOMETRY, GROUND, HEIGHT, POINTS = range(10)
+"""Places in ``counts``."""
+
+COLUMNS, REAL, WHOLE = types.UniTuple(float32[::1], 3), float64[::1], int64[::1]
+
+
+@njit(inline="always")
+def _loss_db(cosine, pattern):  # type: ignore[no-untyped-def]
+    """One-way loss across the array at a direction cosine; pattern: edge in degrees, loss there, most."""
+    angle_deg = np.degrees(np.arcsin(min(max(cosine, -1.0), 1.0)))
+    return min(pattern[1] * (angle_deg / pattern[0]) ** 2, pattern[2])
+
+
+@njit(int64(COLUMNS, REAL, REAL, float64, int64, WHOLE, REAL, REAL, WHOLE), **OPTIONS)
+def describe(columns, board, pattern, sine_fov, start, source, common, level, counts):  # type: ignore[no-untyped-def]
+    """One radar's detections: keep those in the field of view and give what can be compared with the other radar.
+
+    Args:
+        columns: range m, direction cosine, power dB of the radar, float32 [n] each.
+        board: [3], phase centre from the common origin, forward and along the array, m; power offset, dB.
+        pattern: [3], loss across an array: edge in degrees, one-way loss there in dB, most in dB.
+        sine_fov: largest |cosine|.
+        start: first place to fill.
+        source: receives the index in the columns.
+        common: receives the range from the common origin.
+        level: receives the power less the loss that the other radar has at this cosine: equal in both for one target.
+        counts: INVALID and FOV are increased.
+    Returns:
+        One past the last place filled.
+    """
+    range_m, cosine, power_db = columns
+    place = start
+    for n in range(len(range_m)):
+        r, c, p = float64(range_m[n]), float64(cosine[n]), float64(power_db[n])
+        if not (np.isfinite(r) and np.isfinite(c) and np.isfinite(p) and r > 0.0):
+            counts[INVALID] += 1
+            continue
+        if abs(c) > sine_fov:
+            counts[FOV] += 1
+            continue
+        ahead = board[0] * np.sqrt(1.0 - c * c) + board[1] * c
+        common[place] = np.sqrt(max(r * r + 2.0 * r * ahead + board[0] ** 2 + board[1] ** 2, 0.0))
+        level[place] = p + board[2] - 2.0 * _loss_db(c, pattern)
+        source[place] = n
+        place += 1
+    return place
+
+
+@njit(inline="always")
+def _before(i, j, key, tie):  # type: ignore[no-untyped-def]
+    """Whether i sorts before j: by key, then tie, then index."""
+    if key[i] != key[j]:
+        return key[i] < key[j]
+    if tie[i] != tie[j]:
+        return tie[i] < tie[j]
+    return i < j
+
+
+@njit(types.void(WHOLE, int64, int64, REAL, REAL), **OPTIONS)
+def sort(order, first, last, key, tie):  # type: ignore[no-untyped-def]
+    """Heap sort of ``order[first:last]`` by key, then tie, then index, ascending."""
+    size = last - first
+    for step in range(size // 2 + size):
+        root, end = size // 2 - 1 - step, size
+        if root < 0:
+            root, end = 0, size - 1 - (step - size // 2)
+            order[first], order[first + end] = order[first + end], order[first]
+        while 2 * root + 1 < end:
+            child = 2 * root + 1
+            if child + 1 < end and _before(order[first + child], order[first + child + 1], key, tie):
+                child += 1
+            if not _before(order[first + root], order[first + child], key, tie):
+                break
+            order[first + root], order[first + child] = order[first + child], order[first + root]
+            root = child
+
+
+@njit(types.void(WHOLE, int64, int64, int64[:, ::1], int64[:, ::1]), **OPTIONS)
+def neighbours(order, total, split, previous, following):  # type: ignore[no-untyped-def]
+    """For every place in range order: the nearest place of each radar at or before it, and at or after it.
+
+    Args:
+        order: [total], detections in range order.
+        split: detections below it are the horizontal radar's.
+        previous, following: [2, total or more], receive places, row 0 horizontal; -1 and ``total`` when there is none.
+    """
+    last_h, last_v = -1, -1
+    for k in range(total):
+        if order[k] < split:
+            last_h = k
+        else:
+            last_v = k
+        previous[0, k], previous[1, k] = last_h, last_v
+    last_h, last_v = total, total
+    for k in range(total - 1, -1, -1):
+        if order[k] < split:
+            last_h = k
+        else:
+            last_v = k
+        following[0, k], following[1, k] = last_h, last_v
+
+
+@njit(boolean(WHOLE, REAL, int64, int64, int64, int64, float64), **OPTIONS)
+def _linked(order, common, before, after, first, last, gate_m):  # type: ignore[no-untyped-def]
+    """Whether the places exist inside first..last and differ by the gate at most."""
+    return before >= first and after < last and common[order[after]] - common[order[before]] <= gate_m
+
+
+@njit(int64(WHOLE, REAL, int64, int64, float64, int64[:, ::1], int64[:, ::1]), **OPTIONS)
+def cut(order, common, first, last, gate_m, previous, following):  # type: ignore[no-untyped-def]
+    """Where places first..last must be cut: the second part's first place, or ``last`` when they are one range bin.
+
+    A gap that no pair within the gate spans is cut; failing that, when some pair exceeds the gate, the widest gap is.
+    """
+    widest, widest_m = last, -1.0
+    for k in range(first, last - 1):
+        h, v, next_h, next_v = previous[0, k], previous[1, k], following[0, k + 1], following[1, k + 1]
+        forward = _linked(order, common, h, next_v, first, last, gate_m)
+        if not forward and not _linked(order, common, v, next_h, first, last, gate_m):
+            return k + 1
+        gap_m = common[order[k + 1]] - common[order[k]]
+        if gap_m > widest_m:
+            widest, widest_m = k + 1, gap_m
+    if last - first < 2:
+        return last
+    one_bin = _linked(order, common, following[0, first], previous[1, last - 1], first, last, gate_m)
+    one_bin = one_bin and _linked(order, common, following[1, first], previous[0, last - 1], first, last, gate_m)
+    return last if one_bin else widest
+
+
+@njit(int64(WHOLE, REAL, int64, int64, float64, int64[:, ::1], int64[:, ::1], WHOLE, WHOLE), **OPTIONS)
+def divide(order, common, total, split, gate_m, previous, following, stack, bound):  # type: ignore[no-untyped-def]
+    """Divide all detections into range bins whose members of different radars all lie within the gate.
+
+    Args:
+        order: [total], detections in range order.
+        common: [total], range from the common origin.
+        split: detections below it are the horizontal radar's.
+        gate_m: largest difference.
+        previous, following, stack: scratch.
+        bound: [total + 1 or more], receives the bins' first places and, last, ``total``.
+    Returns:
+        Bins, those with one radar's detections only included.
+    """
+    neighbours(order, total, split, previous, following)
+    bins, first, depth = 0, 0, 0
+    bound[0] = 0
+    if total > 0:
+        stack[0], depth = total, 1
+    while depth > 0:
+        last = stack[depth - 1]
+        place = cut(order, common, first, last, gate_m, previous, following)
+        if place < last:
+            stack[depth] = place
+            depth += 1
+        else:
+            bins += 1
+            bound[bins], first = last, last
+            depth -= 1
+    return bins
+
+
+@njit(int64(WHOLE, int64, int64, int64, WHOLE), **OPTIONS)
+def partition(order, first, last, split, scratch):  # type: ignore[no-untyped-def]
+    """Move the horizontal radar's detections in front, keeping the order; returns the vertical ones' first place."""
+    middle, others = first, 0
+    for k in range(first, last):
+        if order[k] < split:
+            order[middle] = order[k]
+            middle += 1
+        else:
+            scratch[others] = order[k]
+            others += 1
+    for k in range(others):
+        order[middle + k] = scratch[k]
+    return middle
+
+
+@njit(int64(WHOLE, REAL, REAL, int64, int64, WHOLE, float64, REAL, WHOLE, int64[:, ::1], WHOLE), **OPTIONS)
+def pair(order, common, level, split, bins, bound, max_db, key, scratch, pairs, counts):  # type: ignore[no-untyped-def]
+    """Pair inside every range bin: by rank of level; unequal counts stop at the first discrepancy beyond ``max_db``.
+
+    Args:
+        order: detections in range order, sorted by level inside the bins afterwards.
+        common, level: by detection.
+        split, bins, bound: as ``divide`` has them.
+        key, scratch: scratch.
+        pairs: int64 [2, n], receives the detections.
+        counts: BINS (with both radars), UNMATCHED and POWER (detections) are increased.
+    Returns:
+        Pairs.
+    """
+    for n in range(bound[bins]):
+        key[n] = -level[n]
+    found = 0
+    for b in range(bins):
+        first, last = bound[b], bound[b + 1]
+        middle = partition(order, first, last, split, scratch)
+        horizontals, verticals = middle - first, last - middle
+        both = min(horizontals, verticals)
+        counts[UNMATCHED] += horizontals + verticals - 2 * both
+        if both == 0:
+            continue
+        counts[BINS] += 1
+        sort(order, first, middle, key, common)
+        sort(order, middle, last, key, common)
+        for rank in range(both):
+            h, v = order[first + rank], order[middle + rank]
+            if horizontals != verticals and abs(level[h] - level[v]) > max_db:
+                counts[POWER] += 2 * (both - rank)
+                break
+            pairs[0, found], pairs[1, found] = h, v
+            found += 1
+    return found
+
+
+@njit(inline="always")
+def _locate(r_h, u, r_v, w, board):  # type: ignore[no-untyped-def]
+    """Whether a point is seen at (r_h, u) by the horizontal and at (r_v, w) by the vertical radar, and its x, y, z.
+
+    With a, b the boards: y = a_y + r_h u and z = b_z + r_v w are exact; x is the mean of the two solutions
+    a_x + sqrt(r_h^2 (1 - u^2) - (z - a_z)^2) and b_x + sqrt(r_v^2 (1 - w^2) - (y - b_y)^2). A negative radicand is
+    u^2 + w^2 > 1 as that board sees it.
+    """
+    y, z = board[0, 1] + r_h * u, board[1, 2] + r_v * w
+    square_h = r_h * r_h * (1.0 - u * u) - (z - board[0, 2]) ** 2
+    square_v = r_v * r_v * (1.0 - w * w) - (y - board[1, 1]) ** 2
+    x = 0.5 * (board[0, 0] + np.sqrt(max(square_h, 0.0)) + board[1, 0] + np.sqrt(max(square_v, 0.0)))
+    return square_h >= 0.0 and square_v >= 0.0, x, y, z
+
+
+@njit(
+    int64(
+        *(int64[:, ::1], int64, WHOLE, COLUMNS, COLUMNS, float64[:, ::1]),
+        *(REAL, REAL, REAL, REAL, float32[:, ::1], float32[:, ::1], WHOLE),
+    ),
+    **OPTIONS,
+)
+def solve(  # type: ignore[no-untyped-def]
+    pairs, found, source, horizontal, vertical, board, offset_db, pattern, up, limits, xyz, out, counts
+):
+    """Place the pairs in space and keep those between ground and largest height.
+
+    Args:
+        pairs: [2, found], detections; ``source`` gives their index in the radar's columns.
+        horizontal, vertical: columns of the radars, as ``describe`` has them.
+        board: [2, 3], phase centres in the rig frame of the reference instant.
+        offset_db: [2], added to the radars' powers.
+        pattern: [3], as ``describe`` has it.
+        up: [4], unit vector up in the rig frame, height of the rig origin.
+        limits: [2], lowest and largest height above ground.
+        xyz: [n, 3], receives the points.
+        out: [3, n], receives power dB, horizontal range, vertical range.
+        counts: GEOMETRY, GROUND and HEIGHT are increased.
+    Returns:
+        Points kept.
+    """
+    range_h, u, power_h = horizontal
+    range_v, w, power_v = vertical
+    kept = 0
+    for n in range(found):
+        h, v = source[pairs[0, n]], source[pairs[1, n]]
+        r_h, cos_h, r_v, cos_v = float64(range_h[h]), float64(u[h]), float64(range_v[v]), float64(w[v])
+        seen, x, y, z = _locate(r_h, cos_h, r_v, cos_v, board)
+        height = up[0] * x + up[1] * y + up[2] * z + up[3]
+        if not seen:
+            counts[GEOMETRY] += 1
+        elif height < limits[0]:
+            counts[GROUND] += 1
+        elif height > limits[1]:
+            counts[HEIGHT] += 1
+        else:
+            sum_db = float64(power_h[h]) + offset_db[0] + float64(power_v[v]) + offset_db[1]
+            out[0, kept] = 0.5 * sum_db + _loss_db(cos_v, pattern) + _loss_db(cos_h, pattern)
+            out[1, kept], out[2, kept] = range_h[h], range_v[v]
+            xyz[kept, 0], xyz[kept, 1], xyz[kept, 2] = x, y, z
+            kept += 1
+    return kept

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Association from its definition in float64: plain loops over pairs, one step of the paper after the other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.config import AntennaSettings, AssociationSettings, Mounting
+from edge.frames import Detections, Float64
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One detection.
+
+    Args:
+        horizontal: of the horizontal radar.
+        index: place in its columns.
+        range_m, cosine, power_db: as detected, power with the mounting's offset.
+        common_m: range from the common origin.
+        level_db: power less the other radar's two-way loss at this cosine.
+    """
+
+    horizontal: bool
+    index: int
+    range_m: float
+    cosine: float
+    power_db: float
+    common_m: float
+    level_db: float
+
+
+def loss_db(cosine: float, antenna: AntennaSettings) -> float:
+    """One-way loss across an array, dB."""
+    angle_deg = math.degrees(math.asin(max(-1.0, min(1.0, cosine))))
+    return min(antenna.across_loss_db * (angle_deg / antenna.across_edge_deg) ** 2, antenna.max_loss_db)
+
+
+def described(
+    detections: Detections,
+    board_m: Float64,
+    origin_m: Float64,
+    offset_db: float,
+    antenna: AntennaSettings,
+    fov_deg: float,
+) -> list[Seen]:
+    """Detections inside the field of view with range from the common origin and comparable level."""
+    horizontal = detections.radar == "horizontal"
+    seen = []
+    for index in range(len(detections)):
+        r, c = float(detections.range_m[index]), float(detections.direction_cosine[index])
+        p = float(detections.power_db[index])
+        if not (math.isfinite(r + c + p) and r > 0.0) or abs(c) > math.sin(math.radians(fov_deg)):
+            continue
+        direction = np.array([math.sqrt(1 - c * c), c, 0.0] if horizontal else [math.sqrt(1 - c * c), 0.0, c])
+        off = board_m - origin_m
+        off[2 if horizontal else 1] = 0.0
+        common = float(np.linalg.norm(off + r * direction))
+        seen.append(Seen(horizontal, index, r, c, p + offset_db, common, p + offset_db - 2.0 * loss_db(c, antenna)))
+    return seen
+
+
+def _within(left: list[Seen], right: list[Seen], gate_m: float) -> bool:
+    """Whether any pair of both radars, one on either side, agrees within the gate."""
+    return any(a.horizontal != b.horizontal and b.common_m - a.common_m <= gate_m for a in left for b in right)
+
+
+def range_bins(seen: list[Seen], gate_m: float) -> list[list[Seen]]:
+    """Range bins of detections in order of range: cut gaps without link, then the widest gap of what is too wide."""
+    for k in range(1, len(seen)):
+        if not _within(seen[:k], seen[k:], gate_m):
+            return range_bins(seen[:k], gate_m) + range_bins(seen[k:], gate_m)
+    if all(a.horizontal == b.horizontal or abs(a.common_m - b.common_m) <= gate_m for a in seen for b in seen):
+        return [seen]
+    gaps = [seen[k].common_m - seen[k - 1].common_m for k in range(1, len(seen))]
+    k = gaps.index(max(gaps)) + 1
+    return range_bins(seen[:k], gate_m) + range_bins(seen[k:], gate_m)
+
+
+def paired(members: list[Seen], max_discrepancy_db: float) -> list[tuple[Seen, Seen]]:
+    """The paper's rule in one range bin: by rank; unequal counts stop at the first discrepancy that is too large."""
+    ranked = sorted(members, key=lambda s: (-s.level_db, s.common_m, s.index))
+    horizontal, vertical = [s for s in ranked if s.horizontal], [s for s in ranked if not s.horizontal]
+    pairs = []
+    for h, v in zip(horizontal, vertical, strict=False):
+        if len(horizontal) != len(vertical) and abs(h.level_db - v.level_db) > max_discrepancy_db:
+            break
+        pairs.append((h, v))
+    return pairs
+
+
+def located(h: Seen, v: Seen, a: Float64, b: Float64) -> Float64 | None:
+    """Point [3] of a pair, boards at a and b: (r_h, u) meets the plane z, (r_v, w) the plane y; mean of both x."""
+    y, z = a[1] + h.range_m * h.cosine, b[2] + v.range_m * v.cosine
+    squares = (
+        h.range_m**2 - (y - a[1]) ** 2 - (z - a[2]) ** 2,
+        v.range_m**2 - (z - b[2]) ** 2 - (y - b[1]) ** 2,
+    )
+    if min(squares) < 0.0:
+        return None
+    return np.array([0.5 * (a[0] + math.sqrt(squares[0]) + b[0] + math.sqrt(squares[1])), y, z])
+
+
+def associate(
+    horizontal: Detections,
+    vertical: Detections,
+    velocity_rig_m_s: Float64,
+    mountings: tuple[Mounting, Mounting],
+    up: Float64,
+    height_m: float,
+    range_bin_m: float,
+    settings: AssociationSettings,
+    antenna: AntennaSettings,
+) -> Float64:
+    """All points of one frame pair.
+
+    Args:
+        horizontal, vertical: detections.
+        velocity_rig_m_s: [3], rig over ground.
+        mountings: of the horizontal and the vertical board.
+        up: [3], unit vector up in the rig frame.
+        height_m: rig origin above ground.
+        range_bin_m: of both radars.
+        settings, antenna: gate, limits, pattern.
+    Returns:
+        float64 [n, 6]: x, y, z, power dB, horizontal range, vertical range; nearest range bin first, strongest first.
+    """
+    delay_s = (vertical.t_first_chirp_ns - horizontal.t_first_chirp_ns) * 1e-9
+    a = np.array(mountings[0].position_m)
+    b = np.array(mountings[1].position_m) + np.asarray(velocity_rig_m_s) * delay_s
+    origin = np.array([0.5 * (a[0] + b[0]), b[1], a[2]])
+    seen = []
+    for detections, board, mounting in ((horizontal, a, mountings[0]), (vertical, b, mountings[1])):
+        seen += described(detections, board, origin, mounting.power_offset_db, antenna, settings.fov_deg)
+    seen.sort(key=lambda s: (s.common_m, s.level_db, not s.horizontal, s.index))
+    rows = []
+    for members in range_bins(seen, settings.range_gate_bins * range_bin_m):
+        for h, v in paired(members, settings.max_discrepancy_db):
+            xyz = located(h, v, a, b)
+            if xyz is None or not settings.ground_margin_m <= float(up @ xyz) + height_m <= settings.max_height_m:
+                continue
+            compensated = (h.power_db + 2 * loss_db(v.cosine, antenna), v.power_db + 2 * loss_db(h.cosine, antenna))
+            rows.append([*xyz.tolist(), 0.5 * sum(compensated), h.range_m, v.range_m])
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)
