@@ -81,6 +81,9 @@ class FrameRegisters:
 class ChirpProfile:
     """One chirp as it is asked for, and as the chip transmits it.
 
+    TI's demo firmware truncates what it reads from its command line, where this rounds: 70 MHz/us would become 1449
+    steps instead of 1450. Text for it must be written from ``registers``.
+
     Args:
         device: chip, a key of ``DEVICES``.
         start_frequency_hz: at the start of the ramp.
