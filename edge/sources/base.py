@@ -5,9 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from edge.frames import LossCause, Pose, RadarFrame, RadarId
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import CaptureError
+from edge.frames import Int16, LossCause, Pose, RadarFrame, RadarId
 
 MAX_LOOPS = 255
 """Most loops a frame of these chips can have (frame configuration message, 8 bits)."""
@@ -62,3 +68,38 @@ def loops_that_fit(nbytes: int, loop_bytes: int) -> tuple[int, ...]:
         return ()
     total = nbytes // loop_bytes
     return tuple(loops for loops in range(1, MAX_LOOPS + 1) if total % loops == 0)
+
+
+def file_size(path: Path) -> int:
+    """Bytes of a capture file; CaptureError when it cannot be looked at."""
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def open_raw(path: Path) -> FileIO:
+    """The file for reading without a buffer; CaptureError when it cannot be opened."""
+    try:
+        return FileIO(path, "rb")
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def read_into(file: FileIO, samples: Int16 | NDArray[np.uint8]) -> bool:
+    """Fill a C-contiguous array from where the file stands, without a copy in between.
+
+    Returns:
+        False when the file ends before.
+    """
+    rest = samples.reshape(-1).view(np.uint8)
+    while rest.size:
+        count = file.readinto(rest.data)
+        if not count:
+            return False
+        rest = rest[count:]
+    return True
+
+
+def _unreadable(path: Path, error: OSError) -> CaptureError:
+    return CaptureError(f"{path} cannot be read", value=error.strerror, action="check the path and its rights")
