@@ -93,6 +93,8 @@ def _csv_values(text: str) -> tuple[int, list[float]]:
     parts = text.split(",")
     if len(parts) != len(COLUMNS):
         raise ValueError(f"{len(parts)} columns instead of {len(COLUMNS)}")
+    if "_" in text or not text.isascii():  # Python's own digits: 1_000 and other scripts
+        raise ValueError("not plain decimal numbers")
     return int(parts[0]), [float(part) for part in parts[1:]]
 
 

@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge.completion.model import CompletionModel
 from edge.config import CompletionSettings, FusionSettings, ObjectSettings, RigGeometry
 from edge.frames import Float32, Float64, FusedCloud, ObjectCloud, PointCloud, Pose
 from edge.fusion.objects import ObjectTracker
+from edge.fusion.temporal import TemporalFusion
 from edge.odometry.track import PoseTrack
 from edge.odometry.transforms import compose, inverse, quaternion, transform_points
 from edge.resources import shipped_dir
@@ -105,9 +107,8 @@ def test_track_agrees_with_doppler(scans: list[Scan]) -> None:
 
 def fuse(scans: list[Scan]) -> list[FusedCloud]:
     """The scans through the real fusion: windows are as long as a stretch without a gap."""
-    temporal = pytest.importorskip("edge.fusion.temporal")
     settings = FusionSettings(travel_m=50.0, max_time_s=20.0, max_pose_gap_s=0.15, min_frames=1)
-    fusion = temporal.TemporalFusion(settings)
+    fusion = TemporalFusion(settings)
     windows: list[FusedCloud | None] = []
     for number, scan in enumerate(scans):
         range_m = np.linalg.norm(scan.xyz_m, axis=1).astype(np.float32)
@@ -139,8 +140,7 @@ def test_scans_become_two_windows_at_their_places(scans: list[Scan]) -> None:
 
 
 def test_objects_and_shapes_of_real_scans(scans: list[Scan]) -> None:
-    completion = pytest.importorskip("edge.completion.model")
-    model = completion.CompletionModel.load(shipped_dir("models") / "default", CompletionSettings())
+    model = CompletionModel.load(shipped_dir("models") / "default", CompletionSettings())
     shapes = 0
     for window, objects in zip(windows := fuse(scans), find_objects(windows), strict=True):
         odom_m = transform_points(window.reference, window.xyz_m)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from edge.errors import ConfigError, PoseError
 from edge.frames import Float64, Pose
@@ -161,6 +163,7 @@ def test_csv_and_json_lines_give_the_same_poses(tmp_path: Path) -> None:
     ("line", "reason"),
     [
         (b"20,0,0,0,0,0,0", "7 columns instead of 8"),
+        (b"2_0,0,0,0,0,0,0,1", "not plain decimal"),
         (b"2.0e1,0,0,0,0,0,0,1", "invalid literal for int"),
         (b"20,0,0,a,0,0,0,1", "could not convert"),
         (b"20,0,0,nan,0,0,0,1", "is no pose"),
@@ -171,7 +174,7 @@ def test_csv_and_json_lines_give_the_same_poses(tmp_path: Path) -> None:
         (b"9223372036854775808,0,0,0,0,0,0,1", "beyond 64 bits"),
         (b"\xff\xfe\x00", "no text"),
         (b"1" * 5000, "too long"),
-        (HEADER, "invalid literal for int"),
+        (HEADER, "not plain decimal"),
         (b'{"t_ns":20,"x":0,"y":0,"z":0,"qx":0,"qy":0,"qz":0}', "lacks 'qw'"),
         (b'{"t_ns":20.0,"x":0,"y":0,"z":0,"qx":0,"qy":0,"qz":0,"qw":1}', "not an integer"),
         (b'{"t_ns":20,"x":"0","y":0,"z":0,"qx":0,"qy":0,"qz":0,"qw":1}', "not a number"),
@@ -192,3 +195,13 @@ def test_bad_line_is_named(line: bytes, reason: str) -> None:
 def test_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(PoseError, match=r"nowhere\.csv cannot be read"):
         list(read_poses(tmp_path / "nowhere.csv"))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.one_of(st.binary(max_size=80), st.from_regex(r"[{\[\]}:,\"0-9a-z_. +-]{0,80}").map(str.encode)))
+def test_no_line_does_anything_but_a_pose_or_a_pose_error(line: bytes) -> None:
+    try:
+        poses = list(parse_poses([line], "fuzz"))
+    except PoseError:
+        poses = []
+    assert len(poses) <= 1
