@@ -15,8 +15,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edge.frames import Float64
-
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "cache": True}
 CELL_SHARE = (1.0 - 1e-6) / np.sqrt(2.0)  # cell side / radius: rounding cannot put one cell's points out of reach
 REACH = 2  # cells to either side that a neighbourhood can touch
@@ -39,7 +37,7 @@ class Grid(NamedTuple):
     order: NDArray[np.int32]
     cell_of: NDArray[np.int32]
     core: NDArray[np.uint8]
-    box: Float64
+    box: NDArray[np.float64]
     parent: NDArray[np.int32]
     label: NDArray[np.int32]
 
