@@ -3,7 +3,7 @@
 
 A grid cell's diagonal is just under the neighbourhood radius, so all points of one cell are neighbours: a cell with
 enough points needs no distance at all, and clusters are unions of cells (Gunawan 2013; Gan and Tao, SIGMOD 2015).
-Work grows with the number of points, not with their density. Distances are float64 and without fastmath, so decisions
+Work grows with the number of points, hardly with their density. Distances are float64 without fastmath, so decisions
 equal those of ``edge/reference/clustering.py`` bit for bit.
 """
 
