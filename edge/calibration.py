@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,12 +35,13 @@ class Waveform:
 
     Args:
         device: as in the chirp profile.
-        slots, receivers: channels in capture order.
+        transmitters: in firing order, one for each slot.
+        receivers: in capture order.
         start_frequency_hz, slope_hz_per_s, sample_rate_hz, samples: of the chirp, as the registers realise them.
     """
 
     device: str
-    slots: int
+    transmitters: tuple[int, ...]
     receivers: int
     start_frequency_hz: float
     slope_hz_per_s: float
@@ -53,7 +54,7 @@ class Waveform:
         profile = schedule.profile
         return cls(
             device=profile.device,
-            slots=schedule.slots,
+            transmitters=schedule.transmitters,
             receivers=profile.chip.chips * profile.chip.rx,
             start_frequency_hz=float(profile.start_frequency_hz),
             slope_hz_per_s=float(profile.slope_hz_per_s_actual),
@@ -178,36 +179,44 @@ def load_calibration(path: Path, schedule: Schedule) -> Calibration:
     refuse_dummy(gain, path, "gain")
     made_with = _waveform(header, path)
     made_with.require_same(Waveform.of(schedule), path)
-    if gain.shape != (made_with.slots, made_with.receivers) or shift.shape != gain.shape:
+    expected = (len(made_with.transmitters), made_with.receivers)
+    if gain.shape != expected or shift.shape != expected:
         raise CalibrationError(
             f"{path}: arrays contradict the header",
             value=f"gain {list(gain.shape)}, range_shift_bins {list(shift.shape)}",
-            allowed=f"[{made_with.slots}, {made_with.receivers}]",
+            allowed=str(list(expected)),
         )
+    measured = _measured(header, gain, shift, made_with, path)
+    gain, shift, found = repair_outliers(measured.gain, measured.range_shift_bins, schedule, path)
+    return replace(measured, gain=gain, range_shift_bins=shift, repaired=(*measured.repaired, *found))
+
+
+def _measured(
+    header: dict[str, Any], gain: NDArray[Any], shift: NDArray[Any], made_with: Waveform, path: Path
+) -> Calibration:
     try:
-        measured = Calibration(
+        reference_m, temperature_c = header["reference_range_m"], header["temperature_c"]
+        return Calibration(
             gain,
             shift,
-            reference_range_m=float(header["reference_range_m"] or math.inf),
+            reference_range_m=math.inf if reference_m is None else float(reference_m),
             board=str(header["board"]),
-            temperature_c=None if header["temperature_c"] is None else float(header["temperature_c"]),
+            temperature_c=None if temperature_c is None else float(temperature_c),
             date=str(header["date"]),
             made_with=made_with,
+            repaired=tuple(str(name) for name in header["repaired"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path}: header cannot be used", value=str(error)) from error
-    gain, shift, repaired = repair_outliers(measured.gain, measured.range_shift_bins, schedule, path)
-    known = tuple(str(name) for name in header.get("repaired", ()))
-    return _with_arrays(measured, gain, shift, tuple(dict.fromkeys((*known, *repaired))))
-
-
-def _with_arrays(c: Calibration, gain: Complex64, shift: Float64, repaired: tuple[str, ...]) -> Calibration:
-    return Calibration(gain, shift, c.reference_range_m, c.board, c.temperature_c, c.date, c.made_with, repaired)
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{path}: {error.what}", value=error.value, allowed=error.allowed, action=error.action
+        ) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], NDArray[Any], NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             header = json.loads(str(stored["header"]))
             gain, shift = stored["gain"], stored["range_shift_bins"]
     except FileNotFoundError as error:
@@ -230,8 +239,9 @@ def _read(path: Path) -> tuple[dict[str, Any], NDArray[Any], NDArray[Any]]:
 
 def _waveform(header: dict[str, Any], path: Path) -> Waveform:
     try:
-        return Waveform(**header["made_with"])
-    except (KeyError, TypeError) as error:
+        made_with = dict(header["made_with"])
+        return Waveform(**{**made_with, "transmitters": tuple(made_with["transmitters"])})
+    except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{path}: header does not say which waveform it was made with",
             value=header.get("made_with"),

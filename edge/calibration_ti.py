@@ -105,9 +105,10 @@ def _made_with(result: Any, params: Any, bins: Float64, wanted: Waveform) -> Wav
     spectrum = np.asarray(getattr(result, "Rx_fft", None))
     samples = spectrum.shape[0] // INTERPOLATION if spectrum.ndim == 3 else wanted.samples
     slope_mhz_per_us = float(getattr(params, "Slope_MHzperus", 0.0) or DEFAULT_SLOPE_HZ_PER_S / 1e12)
+    rows = bins.shape[0]
     return Waveform(
         device=wanted.device,
-        slots=bins.shape[0],
+        transmitters=wanted.transmitters if rows >= max(wanted.transmitters) else tuple(range(1, rows + 1)),
         receivers=bins.shape[1],
         start_frequency_hz=wanted.start_frequency_hz,
         slope_hz_per_s=slope_mhz_per_us * 1e12,

@@ -137,14 +137,14 @@ def known_rigs() -> list[str]:
 
 
 def find_rig(name_or_directory: str | Path) -> Path:
-    """Folder of a rig: a path to one, or the name of a shipped one.
+    """Folder of a rig: a path to it or to its ``rig.toml``, or the name of a shipped one.
 
     Raises:
         ConfigError: neither; lists the known rigs.
     """
     as_path = Path(name_or_directory)
     shipped = shipped_dir("firmware_cfg") / as_path
-    for folder in (as_path, shipped):
+    for folder in (as_path.parent if as_path.name == FILE_NAME else as_path, shipped):
         if (folder / FILE_NAME).is_file():
             return folder
     raise ConfigError(
@@ -200,7 +200,8 @@ def _radar(radar: RadarId, tables: Mapping[str, Any], common: Mapping[str, Any],
     require_known(table, RADAR_KEYS, here)
     own = subtable(table, "schedule", here)
     schedule = fill(Schedule, merged(common, own), here.at("schedule") if own else place.at("schedule"))
-    array = array_for(schedule.profile.device, schedule.transmitters)
+    with place.named():
+        array = array_for(schedule.profile.device, schedule.transmitters)
     name = table.get("calibration")
     if not (name is None or (isinstance(name, str) and name)):
         raise here.at("calibration").error("wrong type", value=name, allowed="name of a file in the rig's folder")

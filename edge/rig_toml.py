@@ -11,7 +11,8 @@ import difflib
 import math
 import tomllib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -48,6 +49,16 @@ class Place:
         """ConfigError that begins with file and key."""
         where = f"{self.file}: {self.key}" if self.key else str(self.file)
         return ConfigError(f"{where}: {what}", value=value, allowed=allowed, action=action)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Put the file's name in front of a ConfigError raised inside."""
+        try:
+            yield
+        except ConfigError as error:
+            raise ConfigError(
+                f"{self.file}: {error.what}", value=error.value, allowed=error.allowed, action=error.action
+            ) from error
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -123,12 +134,8 @@ def fill(kind: type[T], table: Mapping[str, Any], place: Place) -> T:
     if missing:
         allowed = ", ".join(spellings(missing[0]))
         raise place.error("keys are missing", allowed=allowed, action=f"set {', '.join(missing)}")
-    try:
+    with place.named():
         return kind(**values)
-    except ConfigError as error:
-        raise ConfigError(
-            f"{place.file}: {error.what}", value=error.value, allowed=error.allowed, action=error.action
-        ) from error
 
 
 def _has_default(item: Field[Any]) -> bool:
