@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes recordings so that a crash, ``kill -9`` or a full disk costs at most the last second."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+
+from mcap.writer import CompressionType, Writer
+
+from edge.calibration import Calibration, Waveform, save_calibration
+from edge.errors import RecordingError
+from edge.frames import Pose, RadarFrame, RadarId
+from edge.recording import schema
+from edge.rig import Radar, Rig
+
+CHUNK_BYTES = 256 * 1024
+"""A chunk is closed beyond this: a cascade's frame is one, a few frames of a single chip share one."""
+FLUSH_PERIOD_S = 0.5
+"""Chunks that are still open are closed and the file is synchronised this often."""
+LARGEST_ATTACHMENTS = 64 << 20
+TEXT_SUFFIXES = (".toml", ".cfg", ".json", ".txt")
+
+
+class _File:
+    """Unbuffered file that remembers the end of the last complete append and goes back there when one fails."""
+
+    def __init__(self, path: Path) -> None:
+        self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self.position = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self.fd, rest) :]
+        except OSError:
+            os.ftruncate(self.fd, self.position)
+            raise
+        self.position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self.position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        os.close(self.fd)
+
+
+class RecordingWriter:
+    """Appends frames, poses and results to a new MCAP file; any thread may call.
+
+    Messages are kept in the order of the calls; callers write in time order.
+
+    Args:
+        path: must not exist; the folder must.
+        rig: its folder and calibrations are stored with the data.
+    Raises:
+        RecordingError: the file exists or cannot be written; the disk is full, now or in any later call. What was
+            written before stays readable.
+    """
+
+    def __init__(self, path: Path | str, rig: Rig) -> None:
+        self.path, self.rig = Path(path), rig
+        self._layouts = {radar: one.schedule.layout for radar, one in rig.radars.items()}
+        self._lock = threading.Lock()
+        self._failure: RecordingError | None = None
+        self._dirty, self._stop = False, threading.Event()
+        try:
+            self._file = _File(self.path)
+        except OSError as error:
+            action = (
+                "choose another name: recordings are never overwritten" if self.path.exists() else "check the folder"
+            )
+            raise RecordingError(f"{self.path}: cannot be created", value=error.strerror, action=action) from error
+        self._writer = Writer(
+            self._file,  # type: ignore[arg-type]  # write, tell and flush are all that is used
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.NONE,
+        )
+        self._flusher: threading.Thread | None = None
+        try:
+            self._frame_channel, self._pose_channel, self._result_channel = self._head()
+        except OSError as error:
+            self._file.close()
+            raise self._full(error) from error
+        except RecordingError:
+            self._file.close()
+            self.path.unlink(missing_ok=True)
+            raise
+        self._flusher = threading.Thread(target=self._flush_periodically, name="recording-flush", daemon=True)
+        self._flusher.start()
+
+    def frame(self, frame: RadarFrame) -> None:
+        """Append a raw frame; RecordingError when the rig has no such radar or layout."""
+        if self._layouts.get(frame.radar) != frame.layout:
+            raise RecordingError(
+                f"{frame.radar} frame {frame.number} contradicts rig {self.rig.name}",
+                value=frame.layout,
+                allowed=str(self._layouts.get(frame.radar, "no such radar")),
+                action="record with the rig that the frames come from",
+            )
+        payload = b"".join((schema.frame_header(frame), frame.adc.reshape(-1).data.cast("B")))
+        self._append(self._frame_channel[frame.radar], frame.t_first_chirp_ns, payload, frame.number)
+
+    def pose(self, pose: Pose) -> None:
+        """Append a pose."""
+        self._append(self._pose_channel, pose.t_ns, schema.encode_pose(pose), 0)
+
+    def message(self, topic: str, payload: bytes, t_ns: int) -> None:
+        """Append a result as the stream encodes it; RecordingError for a topic that is not in RESULT_TOPICS."""
+        channel = self._result_channel.get(topic)
+        if channel is None:
+            raise RecordingError("topic of no result", value=topic, allowed=", ".join(schema.RESULT_TOPICS))
+        self._append(channel, t_ns, payload, 0)
+
+    def flush(self) -> None:
+        """Close the chunk in progress: what was appended so far survives the death of this process."""
+        with self._lock:
+            self._require_open()
+            self._guarded_flush()
+
+    def close(self) -> None:
+        """Write the summary and close; RecordingError when that fails, the data before stay readable."""
+        self._stop.set()
+        if self._flusher is not None and self._flusher is not threading.current_thread():
+            self._flusher.join()
+            self._flusher = None
+        with self._lock:
+            if self._file.fd < 0:
+                return
+            try:
+                if self._failure is None:
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+                    os.fsync(self._file.fd)
+            except OSError as error:
+                raise self._full(error) from error
+            finally:
+                self._file.close()
+                self._file.fd = -1
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _head(self) -> tuple[dict[RadarId, int], int, dict[str, int]]:
+        """Everything that must be in the file before the first frame."""
+        writer = self._writer
+        writer.start(profile=schema.PROFILE, library="rfconstruct")
+        writer.add_metadata(
+            schema.METADATA,
+            {
+                "format_version": str(schema.FORMAT_VERSION),
+                "rig": self.rig.name,
+                "config_hash": self.rig.config_hash.hex(),
+                "radars": ",".join(self._layouts),
+                "host": platform.node(),
+                "utc_minus_monotonic_ns": str(time.time_ns() - time.monotonic_ns()),
+            },
+        )
+        for name, content in _attachments(self.rig).items():
+            writer.add_attachment(0, 0, name, "application/octet-stream", content)
+        description = (schema.__doc__ or "").encode()
+        frame_schema = writer.register_schema(schema.FRAME_SCHEMA, "x-text", description)
+        pose_schema = writer.register_schema(schema.POSE_SCHEMA, "jsonschema", schema.POSE_JSON_SCHEMA)
+        result_schema = writer.register_schema(schema.RESULT_SCHEMA, "x-text", description)
+        frames: dict[RadarId, int] = {
+            radar: writer.register_channel(schema.FRAME_TOPICS[radar], schema.FRAME_ENCODING, frame_schema)
+            for radar in self._layouts
+        }
+        pose = writer.register_channel(schema.POSE_TOPIC, schema.POSE_ENCODING, pose_schema)
+        results = {
+            topic: writer.register_channel(topic, schema.RESULT_ENCODING, result_schema)
+            for topic in schema.RESULT_TOPICS
+        }
+        return frames, pose, results
+
+    def _append(self, channel: int, t_ns: int, payload: bytes, sequence: int) -> None:
+        if not 0 <= t_ns < 2**63:
+            raise RecordingError("time cannot be recorded", value=t_ns, allowed="0..2^63-1 ns of CLOCK_MONOTONIC")
+        with self._lock:
+            self._require_open()
+            try:
+                self._writer.add_message(channel, t_ns, payload, t_ns, sequence & 0xFFFFFFFF)
+                self._dirty = True
+            except OSError as error:
+                raise self._full(error) from error
+
+    def _require_open(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        if self._file.fd < 0:
+            raise RecordingError(f"{self.path} is closed", action="open a new recording")
+
+    def _guarded_flush(self) -> None:
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._dirty = False
+        except OSError as error:
+            raise self._full(error) from error
+
+    def _flush_periodically(self) -> None:
+        while not self._stop.wait(FLUSH_PERIOD_S):
+            with self._lock:
+                if self._failure is not None:
+                    return
+                if not self._dirty:
+                    continue
+                try:
+                    self._guarded_flush()
+                except RecordingError:
+                    return
+            try:
+                os.fdatasync(self._file.fd)
+            except OSError as error:
+                with self._lock:
+                    self._full(error)
+                return
+
+    def _full(self, error: OSError) -> RecordingError:
+        """Remember the first failure: nothing is written after it."""
+        if self._failure is None:
+            self._failure = RecordingError(
+                f"{self.path}: recording stopped",
+                value=error.strerror,
+                action="free space or mend the disk, then start a new recording; what is in the file stays readable",
+            )
+        return self._failure
+
+
+def _attachments(rig: Rig) -> dict[str, bytes]:
+    """The rig's texts and the calibrations in use, by name in the recording."""
+    found: dict[str, bytes] = {}
+    try:
+        for path in sorted(rig.directory.iterdir()):
+            if path.is_file() and path.suffix in TEXT_SUFFIXES:
+                found[schema.RIG_PREFIX + path.name] = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{rig.directory}: the rig's folder cannot be read", value=error.strerror) from error
+    for radar, one in rig.radars.items():
+        if not _is_identity(one.calibration):
+            found[f"{schema.CALIBRATION_PREFIX}{radar}.npz"] = _calibration_bytes(one)
+    total = sum(map(len, found.values()))
+    if total > LARGEST_ATTACHMENTS:
+        raise RecordingError(
+            f"{rig.directory}: too much to store with every recording",
+            value=f"{total} bytes",
+            allowed=f"at most {LARGEST_ATTACHMENTS} bytes",
+            action="keep other files out of the rig's folder",
+        )
+    return found
+
+
+def _is_identity(calibration: Calibration) -> bool:
+    plain = bool((calibration.gain == 1).all() and (calibration.range_shift_bins == 0).all())
+    return plain and math.isinf(calibration.reference_range_m)
+
+
+def _calibration_bytes(radar: Radar) -> bytes:
+    calibration = radar.calibration
+    if calibration.made_with is None:
+        calibration = replace(calibration, made_with=Waveform.of(radar.schedule))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "calibration.npz"
+        save_calibration(path, calibration)
+        return path.read_bytes()
