@@ -150,6 +150,8 @@ class FusionSettings:
         capacity: points the ring buffer holds; the oldest are overwritten and counted.
         max_pose_gap_s: poses further apart are not interpolated; frames inside are counted as lost.
         min_frames: fewer frames in a window mark it as incomplete.
+        hop_m: travel from the start of a window to the start of the next; 0: half of travel_m.
+        max_speed_m_s, max_turn_deg_s: a step between two frames that is faster is a jump of the odometry.
     """
 
     travel_m: float = 3.0
@@ -157,12 +159,18 @@ class FusionSettings:
     capacity: int = 32768
     max_pose_gap_s: float = 0.1
     min_frames: int = 60
+    hop_m: float = 0.0
+    max_speed_m_s: float = 20.0
+    max_turn_deg_s: float = 180.0
 
     def __post_init__(self) -> None:
         require(self.travel_m > 0, "fusion.travel_m", self.travel_m, "> 0")
         require(self.max_time_s > 0, "fusion.max_time_s", self.max_time_s, "> 0")
         require(self.capacity >= 1024, "fusion.capacity", self.capacity, ">= 1024")
         require(self.max_pose_gap_s > 0, "fusion.max_pose_gap_s", self.max_pose_gap_s, "> 0")
+        require(0 <= self.hop_m <= self.travel_m, "fusion.hop_m", self.hop_m, "0..travel_m (0 = half of it)")
+        require(self.max_speed_m_s > 0, "fusion.max_speed_m_s", self.max_speed_m_s, "> 0")
+        require(self.max_turn_deg_s > 0, "fusion.max_turn_deg_s", self.max_turn_deg_s, "> 0")
 
 
 @dataclass(frozen=True, slots=True)

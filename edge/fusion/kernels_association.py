@@ -17,7 +17,8 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck":
 INVALID, FOV, BINS, UNMATCHED, POWER, PAIRS, GEOMETRY, GROUND, HEIGHT, POINTS = range(10)
 """Places in ``counts``."""
 
-COLUMNS, REAL, WHOLE = types.UniTuple(float32[::1], 3), float64[::1], int64[::1]
+COLUMNS = types.UniTuple(float32[::1], 3)  # type: ignore[no-untyped-call]
+REAL, WHOLE = float64[::1], int64[::1]
 
 
 @njit(inline="always")
