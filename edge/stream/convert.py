@@ -20,30 +20,10 @@ from edge.stream.wire import FLAG_CUT_WINDOW, FLAG_FEW_FRAMES, MAJOR, Draft
 
 FULL_WINDOW_FRAMES = 60
 HEATMAP_STEP_DB = 0.5
-_PLY_TYPES = dict(
-    zip(
-        [
-            "char",
-            "uchar",
-            "short",
-            "ushort",
-            "int",
-            "uint",
-            "float",
-            "double",
-            "int8",
-            "uint8",
-            "int16",
-            "uint16",
-            "int32",
-            "uint32",
-            "float32",
-            "float64",
-        ],
-        ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8") * 2,
-        strict=True,
-    )
-)
+_PLY_FORMATS = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")
+_PLY_OLD = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+_PLY_NEW = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+_PLY_TYPES = dict(zip(_PLY_OLD + _PLY_NEW, _PLY_FORMATS * 2, strict=True))
 _PLY_HEADER_LIMIT = 64 * 2**10
 
 
@@ -60,7 +40,8 @@ def encode_shape(shape: Shape, encoding: str = "f4", send_input: bool = True) ->
         WireError: a point that the encoding cannot hold or that is not finite.
     """
     cloud = shape.input
-    block, payload = pack_points(_xyz(shape.fine_m), encoding)
+    columns = _xyz(shape.fine_m)
+    block, payload = pack_points(columns, encoding)
     fields: dict[str, Any] = {
         "id": shape.identity,
         "cls": shape.class_name,
@@ -68,7 +49,7 @@ def encode_shape(shape: Shape, encoding: str = "f4", send_input: bool = True) ->
         "cls_p": list(shape.class_probability.values()),
         "conf": shape.confidence,
         "pose": _pose(cloud.pose),
-        "size": np.ptp(shape.fine_m, axis=0).tolist(),
+        "size": [float(column.max() - column.min()) for column in columns.values()],
         "n_in": len(cloud),
         "n_frames": cloud.frames,
         "t0_ns": cloud.t_start_ns,
@@ -284,7 +265,8 @@ def _vertex(path: Path, declarations: list[list[str]]) -> tuple[int, list[str], 
 
 
 def _xyz(points_m: Float32) -> dict[str, Float32]:
-    return {name: points_m[:, axis] for axis, name in enumerate("xyz")}
+    """Columns, each contiguous."""
+    return dict(zip("xyz", np.ascontiguousarray(points_m.T, np.float32), strict=True))
 
 
 def _pose(pose: Pose) -> dict[str, Any]:

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Receives results: an iterator of typed messages that knows whether the publisher lives and what was lost."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+
+import zmq
+
+from edge.errors import ConfigError, WireError
+from edge.stream.decode import decode
+from edge.stream.messages import Header, HeartbeatMessage, Message
+from edge.stream.wire import HEARTBEAT_HZ, MAJOR, MESSAGE_LIMIT_BYTES
+
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:5600"
+ALIVE_PERIODS = 10
+"""Heartbeat periods without any message after which the publisher counts as gone."""
+LEAST_RATE = 0.9
+"""Share of the nominal heartbeat rate below which the publisher counts as starved."""
+RATE_WINDOW = 21
+RECEIVE_HIGH_WATER_MARK = 64
+_HEARTBEAT_TOPIC = f"{MAJOR}/hb/"
+
+
+def connect(
+    endpoint: str = DEFAULT_ENDPOINT,
+    topics: Sequence[str] = (),
+    timeout_s: float | None = None,
+    latest: bool = False,
+) -> Client:
+    """Subscribe to an appliance.
+
+    Args:
+        endpoint: its address; it need not be there yet, and is found again after a restart.
+        topics: for example ("shape", "pose") or ("shape/car", "heat/vertical"); none: everything.
+        timeout_s: silence after which iteration ends; None: never.
+        latest: of the messages that wait, give only the newest of each topic (for slow readers).
+    Returns:
+        The client; iterate over it.
+    Raises:
+        ConfigError: the address is not one.
+    """
+    return Client(endpoint, topics, timeout_s, latest)
+
+
+class Client:
+    """The receiving end of docs/wire_format.md; made by ``connect``. Not for use by several threads.
+
+    Args:
+        endpoint, topics, timeout_s, latest: of ``connect``.
+    """
+
+    def __init__(self, endpoint: str, topics: Sequence[str], timeout_s: float | None, latest: bool) -> None:
+        self.endpoint = endpoint
+        self.malformed = 0
+        """Messages that did not follow the format and were dropped."""
+        self.ignored = 0
+        """Messages of a type that this version does not know."""
+        self.skipped = 0
+        """Messages passed over because a newer one of their topic was waiting (``latest``)."""
+        self.restarts = 0
+        """How often the publisher was started anew while this client listened."""
+        self._topics = [f"{MAJOR}/{topic.strip('/')}/" for topic in topics]
+        self._timeout_s, self._latest = timeout_s, latest
+        self._boot = b""
+        self._sequence: dict[str, int] = {}
+        self._lost: dict[str, int] = {}
+        self._beats_ns: deque[int] = deque(maxlen=RATE_WINDOW)
+        self._heard_s: float | None = None
+        self._ready: deque[Message] = deque()
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = _sub_socket(self._context, [*self._topics, _HEARTBEAT_TOPIC] if topics else [""])
+        try:
+            self._socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+            self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise ConfigError(
+                f"cannot connect ({error.strerror})", value=endpoint, allowed="tcp://HOST:PORT or ipc:///PATH"
+            ) from error
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Topic -> messages that are missing in its sequence; a restarted publisher loses nothing by it."""
+        return dict(self._lost)
+
+    @property
+    def alive(self) -> bool:
+        """Whether a message came within the last second, or is waiting to be taken."""
+        if self._socket.closed:
+            return False
+        recent = self._heard_s is not None and time.monotonic() - self._heard_s < ALIVE_PERIODS / HEARTBEAT_HZ
+        return recent or bool(self._ready) or self._socket.poll(0) != 0
+
+    @property
+    def frequency_ok(self) -> bool:
+        """Whether the last heartbeats (up to two seconds of them) came at 90 % of ten a second or more."""
+        if not self.alive or len(self._beats_ns) < 2:
+            return False
+        span_ns = self._beats_ns[-1] - self._beats_ns[0]
+        return (len(self._beats_ns) - 1) * 1e9 >= LEAST_RATE * HEARTBEAT_HZ * span_ns
+
+    def recv(self, timeout_s: float | None = None) -> Message | None:
+        """The next message.
+
+        Args:
+            timeout_s: longest wait; None: as long as it takes.
+        Returns:
+            The message, or None when the time is over or the client is closed.
+        """
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._ready:
+            left_ms = None if deadline_s is None else max(0, round(1000 * (deadline_s - time.monotonic())))
+            if self._socket.closed or not self._socket.poll(left_ms):
+                return None
+            self._take()
+        return self._ready.popleft()
+
+    def close(self) -> None:
+        """Disconnect; iteration ends."""
+        self._socket.close(linger=0)
+        self._context.term()
+
+    def __iter__(self) -> Iterator[Message]:
+        while (message := self.recv(self._timeout_s)) is not None:
+            yield message
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _take(self) -> None:
+        """Take one message, or all that wait and the newest of each topic when only the latest count."""
+        newest: dict[str, Message] = {}
+        for _ in range(RECEIVE_HIGH_WATER_MARK if self._latest else 1):
+            try:
+                frames = self._socket.recv_multipart(zmq.DONTWAIT)
+            except zmq.Again:
+                break
+            message = self._accept(frames)
+            if message is not None:
+                self.skipped += newest.pop(message.header.topic, None) is not None
+                newest[message.header.topic] = message
+        self._ready.extend(newest.values())
+
+    def _accept(self, frames: list[bytes]) -> Message | None:
+        """Decode and account for one message; None when the caller did not ask for it."""
+        try:
+            message = decode(frames)
+        except WireError:
+            self.malformed += 1
+            return None
+        if message is None:
+            self.ignored += 1
+            return None
+        self._heard_s = time.monotonic()
+        self._count(message.header)
+        if isinstance(message, HeartbeatMessage):
+            self._beats_ns.append(message.header.t_pub_ns)
+        wanted = not self._topics or message.header.topic.startswith(tuple(self._topics))
+        return message if wanted else None
+
+    def _count(self, header: Header) -> None:
+        """Gaps in the topic's sequence; another boot or a sequence that goes back is a new start."""
+        last = self._sequence.get(header.topic)
+        if header.boot != self._boot or (last is not None and header.sequence <= last):
+            self.restarts += bool(self._boot)
+            self._boot, last = header.boot, None
+            self._sequence.clear()
+            self._beats_ns.clear()
+        if last is not None and header.sequence > last + 1:
+            self._lost[header.topic] = self._lost.get(header.topic, 0) + header.sequence - last - 1
+        self._sequence[header.topic] = header.sequence
+
+
+def _sub_socket(context: zmq.Context[zmq.Socket[bytes]], prefixes: Sequence[str]) -> zmq.Socket[bytes]:
+    """A SUB socket with bounded queues that notices a dead peer and keeps looking for it."""
+    receiver = context.socket(zmq.SUB)
+    for option, value in (
+        (zmq.RCVHWM, RECEIVE_HIGH_WATER_MARK),
+        (zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES),
+        (zmq.HEARTBEAT_IVL, 1000),
+        (zmq.HEARTBEAT_TIMEOUT, 3000),
+        (zmq.HANDSHAKE_IVL, 2000),
+        (zmq.TCP_KEEPALIVE, 1),
+        (zmq.RECONNECT_IVL, 100),
+        (zmq.RECONNECT_IVL_MAX, 1000),
+    ):
+        receiver.setsockopt(option, value)
+    for prefix in prefixes:
+        receiver.setsockopt_string(zmq.SUBSCRIBE, prefix)
+    return receiver
