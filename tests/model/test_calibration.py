@@ -106,7 +106,7 @@ def test_foreign_calibration_names_both_values(radar, tmp_path, change, value):
 
 def test_calibration_of_another_board_is_foreign(radar, tmp_path):
     save_calibration(tmp_path / "c.npz", measured(radar, np.random.default_rng(3)))
-    with pytest.raises(CalibrationError, match="receivers = 16.*receivers = 4"):
+    with pytest.raises(CalibrationError, match=r"receivers = 16.*receivers = 4"):
         load_calibration(tmp_path / "c.npz", load_rig("awr1843_pair").radars["vertical"].schedule)
 
 
@@ -217,7 +217,7 @@ def ahead(radar, range_m):
 
 
 def test_near_field_reflector_calibrates_a_farther_target(radar, mismatched, tmp_path):
-    """Reflector at 2 m, target at 9 m: only when the curvature is taken out, the peak is that of a perfect correction."""
+    """Reflector at 2 m, target at 9 m: perfect only when the curvature is taken out, but for the grid of TI's FFT."""
     gain, shift, bins, peak = mismatched
     calibration = import_ti_calibration(ti_file(tmp_path / "c.mat", bins.astype(np.uint16), peak), radar.schedule)
     assert calibration.reference_range_m == pytest.approx(2.0, abs=0.05)
@@ -232,7 +232,7 @@ def test_near_field_reflector_calibrates_a_farther_target(radar, mismatched, tmp
 
     perfect_db, _ = peak_of(Calibration(np.exp(-1j * np.angle(gain)), shift - shift[0, 0]))
     aware_db, cosine = peak_of(calibration)
-    assert aware_db == pytest.approx(perfect_db, abs=0.1)
+    assert aware_db == pytest.approx(perfect_db, abs=0.3)
     assert abs(cosine) < 0.004
     assert perfect_db - peak_of(dataclasses.replace(calibration, reference_range_m=np.inf))[0] > 1.0
 
