@@ -13,7 +13,7 @@ from types import TracebackType
 from edge.errors import RecordingError
 from edge.frames import Layout, Pose, RadarFrame, RadarId
 from edge.recording import schema
-from edge.recording.mcap_file import McapFile, Message, ReadReport
+from edge.recording.mcap_reading import McapFile, Message, ReadReport
 from edge.rig import FILE_NAME, Rig, load_rig
 from edge.sources.base import Loss
 

@@ -4,57 +4,26 @@
 from __future__ import annotations
 
 import math
-import os
 import platform
 import tempfile
 import threading
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-
-from mcap.writer import CompressionType, Writer
 
 from edge.calibration import Calibration, Waveform, save_calibration
 from edge.errors import RecordingError
 from edge.frames import Pose, RadarFrame, RadarId
 from edge.recording import schema
+from edge.recording.mcap_writing import AppendFile, Buffer, McapWriter
 from edge.rig import Radar, Rig
 
-CHUNK_BYTES = 256 * 1024
-"""A chunk is closed beyond this: a cascade's frame is one, a few frames of a single chip share one."""
 FLUSH_PERIOD_S = 0.5
-"""Chunks that are still open are closed and the file is synchronised this often."""
+"""What waits in memory is written and the file is synchronised this often."""
 LARGEST_ATTACHMENTS = 64 << 20
 TEXT_SUFFIXES = (".toml", ".cfg", ".json", ".txt")
-
-
-class _File:
-    """Unbuffered file that remembers the end of the last complete append and goes back there when one fails."""
-
-    def __init__(self, path: Path) -> None:
-        self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self.position = 0
-
-    def write(self, data: bytes) -> int:
-        rest = memoryview(data)
-        try:
-            while rest:
-                rest = rest[os.write(self.fd, rest) :]
-        except OSError:
-            os.ftruncate(self.fd, self.position)
-            raise
-        self.position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self.position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def close(self) -> None:
-        os.close(self.fd)
 
 
 class RecordingWriter:
@@ -74,29 +43,25 @@ class RecordingWriter:
         self.path, self.rig = Path(path), rig
         self._layouts = {radar: one.schedule.layout for radar, one in rig.radars.items()}
         self._lock = threading.Lock()
-        self._failure: RecordingError | None = None
+        self._failure = ""
         self._dirty, self._stop = False, threading.Event()
         try:
-            self._file = _File(self.path)
+            self._file = AppendFile(self.path)
         except OSError as error:
-            action = (
-                "choose another name: recordings are never overwritten" if self.path.exists() else "check the folder"
-            )
-            raise RecordingError(f"{self.path}: cannot be created", value=error.strerror, action=action) from error
-        self._writer = Writer(
-            self._file,  # type: ignore[arg-type]  # write, tell and flush are all that is used
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.NONE,
-        )
-        self._flusher: threading.Thread | None = None
+            exists = isinstance(error, FileExistsError)
+            raise RecordingError(
+                f"{self.path}: cannot be created",
+                value=error.strerror,
+                action="choose another name: recordings are never overwritten" if exists else "check the folder",
+            ) from error
         try:
+            self._writer = McapWriter(self._file, schema.PROFILE, "rfconstruct")
             self._frame_channel, self._pose_channel, self._result_channel = self._head()
-        except OSError as error:
-            self._file.close()
-            raise self._full(error) from error
-        except RecordingError:
+        except (OSError, RecordingError) as error:
             self._file.close()
             self.path.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise self._stopped(error) from error
             raise
         self._flusher = threading.Thread(target=self._flush_periodically, name="recording-flush", daemon=True)
         self._flusher.start()
@@ -110,44 +75,39 @@ class RecordingWriter:
                 allowed=str(self._layouts.get(frame.radar, "no such radar")),
                 action="record with the rig that the frames come from",
             )
-        payload = b"".join((schema.frame_header(frame), frame.adc.reshape(-1).data.cast("B")))
-        self._append(self._frame_channel[frame.radar], frame.t_first_chirp_ns, payload, frame.number)
+        parts = (schema.frame_header(frame), frame.adc.reshape(-1).data.cast("B"))
+        self._append(self._frame_channel[frame.radar], frame.t_first_chirp_ns, parts, frame.number)
 
     def pose(self, pose: Pose) -> None:
         """Append a pose."""
-        self._append(self._pose_channel, pose.t_ns, schema.encode_pose(pose), 0)
+        self._append(self._pose_channel, pose.t_ns, (schema.encode_pose(pose),))
 
     def message(self, topic: str, payload: bytes, t_ns: int) -> None:
         """Append a result as the stream encodes it; RecordingError for a topic that is not in RESULT_TOPICS."""
         channel = self._result_channel.get(topic)
         if channel is None:
             raise RecordingError("topic of no result", value=topic, allowed=", ".join(schema.RESULT_TOPICS))
-        self._append(channel, t_ns, payload, 0)
+        self._append(channel, t_ns, (payload,))
 
     def flush(self) -> None:
-        """Close the chunk in progress: what was appended so far survives the death of this process."""
+        """Write what waits in memory: what was appended so far survives the death of this process."""
         with self._lock:
             self._require_open()
-            self._guarded_flush()
+            self._guarded(self._writer.flush)
 
     def close(self) -> None:
         """Write the summary and close; RecordingError when that fails, the data before stay readable."""
         self._stop.set()
-        if self._flusher is not None and self._flusher is not threading.current_thread():
-            self._flusher.join()
-            self._flusher = None
+        self._flusher.join()
         with self._lock:
-            if self._file.fd < 0:
+            if self._file.closed:
                 return
             try:
-                if self._failure is None:
-                    self._writer.finish()  # type: ignore[no-untyped-call]
-                    os.fsync(self._file.fd)
-            except OSError as error:
-                raise self._full(error) from error
+                if not self._failure:
+                    self._guarded(self._writer.finish)
+                    self._guarded(self._file.sync)
             finally:
                 self._file.close()
-                self._file.fd = -1
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -160,86 +120,79 @@ class RecordingWriter:
     def _head(self) -> tuple[dict[RadarId, int], int, dict[str, int]]:
         """Everything that must be in the file before the first frame."""
         writer = self._writer
-        writer.start(profile=schema.PROFILE, library="rfconstruct")
         writer.add_metadata(
             schema.METADATA,
             {
                 "format_version": str(schema.FORMAT_VERSION),
                 "rig": self.rig.name,
                 "config_hash": self.rig.config_hash.hex(),
-                "radars": ",".join(self._layouts),
                 "host": platform.node(),
                 "utc_minus_monotonic_ns": str(time.time_ns() - time.monotonic_ns()),
             },
         )
         for name, content in _attachments(self.rig).items():
-            writer.add_attachment(0, 0, name, "application/octet-stream", content)
+            writer.add_attachment(name, "application/octet-stream", content)
         description = (schema.__doc__ or "").encode()
-        frame_schema = writer.register_schema(schema.FRAME_SCHEMA, "x-text", description)
-        pose_schema = writer.register_schema(schema.POSE_SCHEMA, "jsonschema", schema.POSE_JSON_SCHEMA)
-        result_schema = writer.register_schema(schema.RESULT_SCHEMA, "x-text", description)
+        frame_schema = writer.add_schema(schema.FRAME_SCHEMA, "x-text", description)
+        pose_schema = writer.add_schema(schema.POSE_SCHEMA, "jsonschema", schema.POSE_JSON_SCHEMA)
+        result_schema = writer.add_schema(schema.RESULT_SCHEMA, "x-text", description)
         frames: dict[RadarId, int] = {
-            radar: writer.register_channel(schema.FRAME_TOPICS[radar], schema.FRAME_ENCODING, frame_schema)
+            radar: writer.add_channel(schema.FRAME_TOPICS[radar], schema.FRAME_ENCODING, frame_schema)
             for radar in self._layouts
         }
-        pose = writer.register_channel(schema.POSE_TOPIC, schema.POSE_ENCODING, pose_schema)
+        pose = writer.add_channel(schema.POSE_TOPIC, schema.POSE_ENCODING, pose_schema)
         results = {
-            topic: writer.register_channel(topic, schema.RESULT_ENCODING, result_schema)
-            for topic in schema.RESULT_TOPICS
+            topic: writer.add_channel(topic, schema.RESULT_ENCODING, result_schema) for topic in schema.RESULT_TOPICS
         }
         return frames, pose, results
 
-    def _append(self, channel: int, t_ns: int, payload: bytes, sequence: int) -> None:
+    def _append(self, channel: int, t_ns: int, parts: Sequence[Buffer], sequence: int = 0) -> None:
         if not 0 <= t_ns < 2**63:
             raise RecordingError("time cannot be recorded", value=t_ns, allowed="0..2^63-1 ns of CLOCK_MONOTONIC")
         with self._lock:
             self._require_open()
-            try:
-                self._writer.add_message(channel, t_ns, payload, t_ns, sequence & 0xFFFFFFFF)
-                self._dirty = True
-            except OSError as error:
-                raise self._full(error) from error
+            self._guarded(lambda: self._writer.add_message(channel, t_ns, parts, sequence & 0xFFFFFFFF))
+            self._dirty = True
 
     def _require_open(self) -> None:
-        if self._failure is not None:
-            raise self._failure
-        if self._file.fd < 0:
+        if self._failure:
+            raise self._stopped()
+        if self._file.closed:
             raise RecordingError(f"{self.path} is closed", action="open a new recording")
 
-    def _guarded_flush(self) -> None:
+    def _guarded(self, action: Callable[[], None]) -> None:
         try:
-            self._writer.flush()  # type: ignore[no-untyped-call]
-            self._dirty = False
+            action()
         except OSError as error:
-            raise self._full(error) from error
+            raise self._stopped(error) from error
 
     def _flush_periodically(self) -> None:
+        """Of the background thread; its failure is raised by the next call of anybody."""
         while not self._stop.wait(FLUSH_PERIOD_S):
-            with self._lock:
-                if self._failure is not None:
-                    return
-                if not self._dirty:
-                    continue
-                try:
-                    self._guarded_flush()
-                except RecordingError:
-                    return
             try:
-                os.fdatasync(self._file.fd)
+                with self._lock:
+                    if self._failure:
+                        return
+                    dirty, self._dirty = self._dirty, False
+                    self._guarded(self._writer.flush)
+                if dirty:
+                    self._file.sync()
+            except RecordingError:
+                return
             except OSError as error:
                 with self._lock:
-                    self._full(error)
+                    self._stopped(error)
                 return
 
-    def _full(self, error: OSError) -> RecordingError:
+    def _stopped(self, error: OSError | None = None) -> RecordingError:
         """Remember the first failure: nothing is written after it."""
-        if self._failure is None:
-            self._failure = RecordingError(
-                f"{self.path}: recording stopped",
-                value=error.strerror,
-                action="free space or mend the disk, then start a new recording; what is in the file stays readable",
-            )
-        return self._failure
+        if error is not None and not self._failure:
+            self._failure = error.strerror or str(error)
+        return RecordingError(
+            f"{self.path}: recording stopped",
+            value=self._failure,
+            action="free space or mend the disk, then start a new recording; what is in the file stays readable",
+        )
 
 
 def _attachments(rig: Rig) -> dict[str, bytes]:
