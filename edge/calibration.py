@@ -165,16 +165,11 @@ def load_calibration(path: Path, schedule: Schedule) -> Calibration:
     """Read a calibration and check that it belongs to ``schedule``; outlier channels are repaired and named.
 
     Args:
-        path: a file of ``save_calibration``, or TI's ``calibrateResults_high.mat`` (needs the ``import`` extra).
+        path: a file of ``save_calibration``.
         schedule: of the radar that will use it.
     Raises:
         CalibrationError: unreadable, of another format, a dummy, of another waveform, or too many outliers.
-        DependencyError: a ``.mat`` file without SciPy.
     """
-    if path.suffix == ".mat":
-        from edge.calibration_ti import import_ti_calibration
-
-        return import_ti_calibration(path, schedule)
     header, gain, shift = _read(path)
     refuse_dummy(gain, path, "gain")
     made_with = _waveform(header, path)
@@ -227,7 +222,7 @@ def _read(path: Path) -> tuple[dict[str, Any], NDArray[Any], NDArray[Any]]:
         raise CalibrationError(
             f"{path}: not a calibration file",
             value=str(error),
-            allowed="an .npz written by save_calibration, or TI's .mat",
+            allowed="an .npz written by save_calibration",
         ) from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         found = header.get("format") if isinstance(header, dict) else header

@@ -14,6 +14,7 @@ import numpy as np
 
 from edge.array import VirtualArray, array_for
 from edge.calibration import Calibration, load_calibration
+from edge.calibration_ti import import_ti_calibration
 from edge.config import Mounting, PipelineSettings, RigGeometry, require
 from edge.constraints import DRIFT_S_PER_S, REARM_S, Constraint, check_interleave, check_schedule, require_passed
 from edge.errors import ConfigError
@@ -111,15 +112,16 @@ class Rig:
         return digest.digest()
 
     def with_calibration(self, radar: RadarId, path: Path) -> Rig:
-        """This rig with another calibration file for one radar.
+        """This rig with another calibration file for one radar: ours, or TI's ``.mat``.
 
         Raises:
             ConfigError: the rig has no such radar.
-            CalibrationError: as ``load_calibration``.
+            CalibrationError: as ``load_calibration`` and ``import_ti_calibration``.
+            DependencyError: a ``.mat`` file without SciPy.
         """
         if radar not in self.radars:
             raise ConfigError(f"rig {self.name} has no such radar", value=radar, allowed=", ".join(self.radars))
-        calibrated = replace(self.radars[radar], calibration=load_calibration(path, self.radars[radar].schedule))
+        calibrated = replace(self.radars[radar], calibration=_calibration(path, self.radars[radar].schedule))
         return replace(self, radars={**self.radars, radar: calibrated})
 
     def constraints(self) -> list[Constraint]:
@@ -209,6 +211,11 @@ def _radar(radar: RadarId, tables: Mapping[str, Any], common: Mapping[str, Any],
         shape = array.position.shape
         calibration = Calibration(np.ones(shape, dtype=np.complex64), np.zeros(shape))
     else:
-        calibration = load_calibration(place.file.parent / name, schedule)
+        calibration = _calibration(place.file.parent / name, schedule)
     mounting = fill(Mounting, subtable(table, "mounting", here), here.at("mounting"))
     return Radar(radar, schedule, array, mounting, calibration)
+
+
+def _calibration(path: Path, schedule: Schedule) -> Calibration:
+    read = import_ti_calibration if path.suffix == ".mat" else load_calibration
+    return read(path, schedule)

@@ -150,9 +150,9 @@ def test_other_files_are_refused(radar, tmp_path, content):
 
 
 def test_absent_file_is_refused(radar, tmp_path):
-    for name in ("c.npz", "c.mat"):
+    for name, read in (("c.npz", load_calibration), ("c.mat", import_ti_calibration)):
         with pytest.raises(CalibrationError, match="no such calibration file"):
-            load_calibration(tmp_path / name, radar.schedule)
+            read(tmp_path / name, radar.schedule)
 
 
 def test_outliers_are_repaired_and_named(radar, tmp_path):
@@ -263,7 +263,7 @@ def test_ti_dummy_is_refused(radar, mismatched, tmp_path, dummy):
 def test_ti_foreign_is_refused(radar, mismatched, tmp_path, change):
     path = ti_file(tmp_path / "c.mat", *mismatched[2:], **change)
     with pytest.raises(CalibrationError, match="foreign"):
-        load_calibration(path, radar.schedule)
+        import_ti_calibration(path, radar.schedule)
 
 
 def test_ti_file_of_a_smaller_board_is_foreign(radar, mismatched, tmp_path):
