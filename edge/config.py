@@ -236,8 +236,8 @@ class StreamSettings:
 
     Args:
         endpoints: ZeroMQ addresses to bind; only ipc:// and loopback are accepted.
-        send_high_water_mark: messages queued per subscriber before the newest are dropped for it; a window and its
-            shapes go out in one burst, of which 4 lost one message in fifty with a subscriber that kept up.
+        send_high_water_mark: messages queued per subscriber before the newest are dropped for it; a window and
+            its shapes leave in one burst, and a queue of 4 drops some of it even for a subscriber that keeps up.
         shape_encoding: number format of a shape's points: f4, f2 (0.5 mm within 2 m) or i2 (0.5 mm within 32 m).
     """
 

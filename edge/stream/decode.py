@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.errors import PoseError, WireError
 from edge.frames import RADARS, Detections, Float32, FusedCloud, PointCloud, Pose, RadarId
@@ -47,7 +48,10 @@ def decode(frames: Sequence[bytes]) -> Message | None:
     """
     received = unpack(frames)
     reader = _READERS.get(received.fields.text("type"))
-    return None if reader is None else reader(read_header(received), received)
+    if reader is None:
+        return None
+    with np.errstate(all="ignore"):  # numbers beyond float32 become infinite and are refused where they matter
+        return reader(read_header(received), received)
 
 
 def read_header(received: Received) -> Header:
@@ -78,7 +82,15 @@ def _payload(received: Received, number: int) -> bytes:
 
 def _xyz(received: Received, key: str, number: int) -> Float32:
     columns = read_points(received.fields.section(key), _payload(received, number), ("x", "y", "z"))
-    return np.stack([columns[name] for name in ("x", "y", "z")], axis=1)
+    return _stacked(columns)
+
+
+def _stacked(columns: dict[str, NDArray[Any]]) -> Float32:
+    """Coordinates float32 [n, 3]; all of them numbers."""
+    points = np.stack([columns[name] for name in ("x", "y", "z")], axis=1)
+    if not np.isfinite(points).all():
+        raise WireError("coordinates are not finite")
+    return points
 
 
 def _columns(received: Received, key: str, number: int, names: Sequence[str]) -> list[Float32]:
@@ -121,7 +133,7 @@ def _cloud(header: Header, received: Received) -> CloudMessage:
     fields = received.fields
     columns = read_points(fields.section("pts"), _payload(received, 0), ("x", "y", "z", "power", "frame"))
     cloud = FusedCloud(
-        xyz_m=np.stack([columns[name] for name in ("x", "y", "z")], axis=1),
+        xyz_m=_stacked(columns),
         power_db=columns["power"].astype(np.float32, copy=False),
         frame_number=columns["frame"].astype(np.int64),
         reference=_pose(fields.section("pose")),
@@ -142,6 +154,8 @@ def _heatmap(header: Header, received: Received) -> HeatmapMessage:
         axes.append((axis.number("first") + axis.number("step") * np.arange(count)).astype(np.float32))
     if len(axes) != 2 or len(axes[0]) * len(axes[1]) != len(payload):
         raise WireError("heat: axes contradict the payload", value=([len(a) for a in axes], len(payload)))
+    if not all(np.isfinite(axis).all() for axis in axes):
+        raise WireError("heat: axes are not finite")
     levels = np.frombuffer(payload, np.uint8).reshape(len(axes[0]), len(axes[1]))
     power_db = np.float32(fields.number("offset")) + np.float32(fields.number("scale")) * levels.astype(np.float32)
     radar = cast(RadarId, fields.text("radar", RADARS))

@@ -72,7 +72,7 @@ def read_points(block: Fields, payload: bytes, names: Sequence[str]) -> dict[str
     formats, offsets = zip(*(found[name] for name in names), strict=True)
     layout = np.dtype({"names": list(names), "formats": formats, "offsets": offsets, "itemsize": step})
     records = np.frombuffer(payload, layout)
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         return {
             name: (records[name] * scale).astype(np.float32) if name in ("x", "y", "z") else _native(records[name])
             for name in names
