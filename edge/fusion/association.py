@@ -10,8 +10,9 @@ Range bins. Each range is moved to a common origin that has the vertical board's
 vertical coordinate: r^2 = r_h^2 + 2 r_h (d . o) + |o|^2, o the board's place from the origin, d the direction. The
 component of d along the own array is measured; the forward one, sqrt(1 - u^2) for want of w, only matters for boards
 that are not side by side. Detections in order of that range are cut wherever no pair of both radars within the gate
-spans the gap; a part that still holds a pair beyond the gate is cut at its widest gap, and so on. Thus every two
-detections of different radars in one bin agree within the gate, and neither radar and no grid is preferred.
+spans the gap; a part that still holds a pair beyond the gate is cut at its widest gap (of equals the nearest), and so
+on. Thus every two detections of different radars in one bin agree within the gate, and neither radar and no grid is
+preferred.
 
 Powers. Either radar compensates the gain along its own array. Across it the horizontal radar loses 2 L(w) and the
 vertical one 2 L(u), known only for a pair: P_h + 2 L(w) against P_v + 2 L(u). This difference is that of P_h - 2 L(u)

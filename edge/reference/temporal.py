@@ -70,13 +70,14 @@ def fuse(clouds: Sequence[PointCloud], poses: Sequence[Pose], settings: FusionSe
     path_m, broken = paths(poses, settings)
     hop_m = settings.hop_m or 0.5 * settings.travel_m
     seconds = [(pose.t_ns - poses[0].t_ns) / 1e9 for pose in poses]
+    to_odom = [matrix(pose) for pose in poses]
 
     def window(first: int, last: int, covered: bool) -> Window:
-        back = np.linalg.inv(matrix(poses[first]))
+        back = np.linalg.inv(to_odom[first])
         moved = [np.zeros((0, 3))]
         for k in range(first, last + 1):
             points = np.column_stack([clouds[k].xyz_m.astype(np.float64), np.ones(len(clouds[k]))])
-            moved.append((points @ (back @ matrix(poses[k])).T)[:, :3])
+            moved.append((points @ (back @ to_odom[k]).T)[:, :3])
         complete = covered and last - first + 1 >= settings.min_frames
         return Window(first, last, max(path_m[last] - path_m[first], 0.0), complete, np.concatenate(moved))
 

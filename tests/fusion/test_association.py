@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,10 +14,14 @@ from hypothesis import strategies as st
 
 from edge.config import AntennaSettings, AssociationSettings, CfarSettings, Mounting, RigGeometry
 from edge.dsp.antenna import across_loss_db
+from edge.dsp.detector import Detector
+from edge.dsp.imager import Imager
 from edge.errors import CaptureError, ConfigError, PoseError
-from edge.frames import Detections
+from edge.frames import Detections, RadarId
 from edge.fusion.association import Associator, up_in_rig
 from edge.reference.association import associate
+from edge.reference.point_targets import make_frame
+from edge.rig import load_rig
 
 BIN_M = 0.0594
 PERIOD_NS = 16_666_667
@@ -132,6 +137,14 @@ def test_a_chain_longer_than_the_gate_is_cut_at_its_widest_gap() -> None:
     assert associator.last_report.bins == 2
     np.testing.assert_allclose(cloud.range_horizontal_m, ranges[[0, 2]], rtol=1e-6)
     np.testing.assert_allclose(cloud.range_vertical_m, ranges[[1, 3]], rtol=1e-6)
+
+
+def test_of_equal_gaps_the_nearest_is_cut() -> None:
+    """Horizontal 1 dB, vertical 1, horizontal 8, vertical 8, all 1/32 m apart: the last three are one bin."""
+    horizontal, vertical = [[5.0, 0.1, 1.0], [5.0625, 0.2, 8.0]], [[5.03125, -0.1, 1.0], [5.09375, -0.2, 8.0]]
+    cloud = Associator(rig(range_gate_bins=0.6)).process(*both(horizontal, vertical))
+    np.testing.assert_array_equal(cloud.range_horizontal_m, np.float32([5.0625]))
+    np.testing.assert_array_equal(cloud.range_vertical_m, np.float32([5.09375]))
 
 
 @pytest.mark.parametrize("u", [0.7, -0.7])
@@ -285,6 +298,28 @@ def test_a_rig_of_one_radar_cannot_associate() -> None:
     del lone.radars["vertical"]
     with pytest.raises(ConfigError, match="without vertical"):
         Associator(lone)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_scatterers_come_out_of_raw_frames_where_they_are(sign: Literal[1, -1]) -> None:
+    """Displaced boards, turned arrays, cable delay, travel between the bursts: through heatmaps and detections."""
+    demo = load_rig("cascade_demo")
+    boards: dict[RadarId, Mounting] = {
+        "horizontal": Mounting((0.0, 0.2, 0.0), array_sign=sign, range_offset_m=0.1),
+        "vertical": Mounting((0.03, 0.0, -0.15), array_sign=sign, range_offset_m=-0.05),
+    }
+    radars = {name: replace(radar, mounting=boards[name]) for name, radar in demo.radars.items()}
+    demo = replace(demo, radars=radars, geometry=RigGeometry(height_m=1.5))
+    scatterers, velocity = np.array([[3.0, 1.2, -0.4], [4.5, -2.0, 0.7], [7.0, 3.0, 0.2]]), np.array([0.05, -0.2, 0.0])
+    seen = []
+    for name, t_ns in (("horizontal", 0), ("vertical", HALF_NS)):
+        radar = demo.radars[name]  # type: ignore[index]
+        frame = make_frame(radar, scatterers - velocity * t_ns * 1e-9, 200.0, 3, t_ns, velocity)
+        heatmap = Imager(radar, demo.settings.heatmap, demo.settings.antenna).process(frame, velocity)
+        seen.append(Detector(radar, demo.settings.cfar).process(heatmap))
+    cloud = Associator(demo).process(seen[0], seen[1], velocity)
+    assert len(cloud) == len(scatterers)
+    np.testing.assert_allclose(cloud.xyz_m, scatterers, atol=0.01)
 
 
 def random_rows(rng: np.random.Generator, count: int, clustered: bool) -> Any:
