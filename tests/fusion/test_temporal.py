@@ -56,7 +56,7 @@ def test_points_of_a_static_world_land_on_themselves_while_the_rig_drives_and_tu
         seen = (world - position) @ matrix(pose)[:3, :3]
         window = fusion.add(cloud(k, pose.t_ns, seen), pose)
         windows += [window] if window is not None else []
-    assert windows
+    assert [window.complete for window in windows] == [True]
     for window in windows:
         expected = (world - window.reference.position_m) @ matrix(window.reference)[:3, :3]
         off = window.xyz_m.reshape(-1, len(world), 3) - expected
@@ -192,6 +192,7 @@ def test_a_window_that_begins_among_overwritten_points_has_only_those_that_are_l
     fusion = TemporalFusion(FusionSettings(travel_m=3.0, capacity=1024, hop_m=0.1))
     windows = drive(fusion, straight(0.5, 400), np.ones((4, 3)))
     assert len(windows) > 2
+    assert fusion.overwritten == 4 * 400 - 1024, "every point once"
     for window in windows:
         last = window.t_end_ns // FRAME_NS
         np.testing.assert_array_equal(window.frame_number, np.repeat(np.arange(last - 255, last + 1), 4))
