@@ -148,7 +148,8 @@ class FusionSettings:
         travel_m: path length of a window (paper: about 3).
         max_time_s: longest window.
         capacity: points the ring buffer holds; the oldest are overwritten and counted.
-        max_pose_gap_s: poses further apart are not interpolated; frames inside are counted as lost.
+        max_pose_gap_s: poses further apart are not interpolated; frames inside are counted as lost. Frames further
+            apart end a window, so it must exceed the frame period of a slow source.
         min_frames: fewer frames in a window mark it as incomplete.
         hop_m: travel from the start of a window to the start of the next; 0: half of travel_m.
         max_speed_m_s, max_turn_deg_s: a step between two frames that is faster is a jump of the odometry.
