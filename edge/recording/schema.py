@@ -120,9 +120,10 @@ def decode_frame(payload: memoryview) -> RadarFrame:
             action="read it with the version of rfconstruct that wrote it",
         )
     samples = payload[FRAME_HEADER.size :]
-    if max(radar, kind, iq_order) > 1 or not all((devices, *axes)) or (kind == 1 and devices != 1):
-        raise RecordingError("raw frame with an impossible header", value=(radar, kind, iq_order, devices, *axes))
     loops, slots, samples_per_chirp, rx = axes
+    single_chip = devices == 1 and samples_per_chirp % 2 == 0
+    if max(radar, kind, iq_order) > 1 or not all((devices, *axes)) or (kind == 1 and not single_chip):
+        raise RecordingError("raw frame with an impossible header", value=(radar, kind, iq_order, devices, *axes))
     layout = Layout(_KINDS[kind], devices, loops, slots, samples_per_chirp, rx, _IQ_ORDERS[iq_order])
     if len(samples) != layout.nbytes:
         raise RecordingError("raw frame of a wrong size", value=len(samples), allowed=f"{layout.nbytes} bytes")
