@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from edge.errors import ExitCode, RfconstructError
+from edge.version import version
 
 VERBS = {
     "demo": "drive past one object (simulated point scatterers), publish its shape, draw pictures",
@@ -55,16 +56,6 @@ def overview() -> str:
     lines += ["", "rfconstruct COMMAND --help shows the options of one command."]
     lines += ["exit codes: 0 ok, 1 failure, 2 usage, 3 degraded, 4 no hardware, 5 bad configuration, 6 bad model"]
     return "\n".join(lines)
-
-
-def version() -> str:
-    """Version of the installed distribution."""
-    from importlib import metadata
-
-    try:
-        return metadata.version("rfconstruct")
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _run(verb: str, rest: Sequence[str]) -> int:

@@ -16,7 +16,7 @@ from edge.completion.model import CompletionModel
 from edge.dsp.checks import FrameRejected
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
-from edge.errors import ModelError, PoseError
+from edge.errors import CaptureError, ModelError, PoseError
 from edge.frames import (
     RADARS,
     Detections,
@@ -202,7 +202,12 @@ class Pipeline:
         for radar, heatmap in heatmaps.items():
             with self.times.measure("detect"):
                 detections[radar] = self._detectors[radar].process(heatmap)
-        cloud = self._associate(detections, velocity_m_s)
+        try:
+            cloud = self._associate(detections, velocity_m_s)
+        except CaptureError as error:
+            self.faults.last = str(error)
+            self._lose_pair(pair, LossCause.UNPAIRED)
+            return
         for radar in pair.frames:
             self.ledgers[radar].ok()
         result = FrameResult(pair.number, pair.t_ns, heatmaps, detections, cloud, pose)

@@ -1,46 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sink that publishes what the pipeline gives, at the rates of the wire format."""
+"""A sink that publishes what the pipeline gives; the publisher keeps the rates of the wire format."""
 
 from __future__ import annotations
 
+import resource
 import time
 
 from edge.pipeline import FrameResult, Pipeline, WindowResult
+from edge.stream.messages import LEVELS, RadarStatus, Reason, State, Status
 from edge.stream.publisher import Publisher
-
-HEATMAP_PERIOD_NS = 100_000_000
-HEARTBEAT_PERIOD_NS = 100_000_000
-STATUS_PERIOD_NS = 1_000_000_000
 
 
 class PublishingSink:
-    """Publishes detections, points and poses of every frame, heatmaps 10 times and status once a second at most.
+    """Publishes detections, points, poses and heatmaps of every frame, windows and shapes, status and heartbeat.
 
     Args:
         publisher: open.
-        pipeline: whose counters the status message carries; set by ``watch``.
+        version: of the software, for the status message.
     """
 
-    def __init__(self, publisher: Publisher) -> None:
-        self._publisher = publisher
+    def __init__(self, publisher: Publisher, version: str) -> None:
+        self._publisher, self._version = publisher, version
         self._pipeline: Pipeline | None = None
-        self._due_ns = {"heatmap": 0, "heartbeat": 0, "status": 0}
+        self._start_s = time.monotonic()
+        self._reasons: dict[str, tuple[int, int, int]] = {}
+        """Code -> count, first and last instant."""
 
     def watch(self, pipeline: Pipeline) -> None:
         """Take the status message's counters from this pipeline."""
         self._pipeline = pipeline
 
     def frame(self, result: FrameResult) -> None:
-        """Publish one frame's results."""
-        publisher = self._publisher
-        if self._is_due("heatmap", HEATMAP_PERIOD_NS):
-            for heatmap in result.heatmaps.values():
-                publisher.heatmap(heatmap)
-        if result.cloud is not None:
-            publisher.detections(result.cloud)
+        """Publish one frame's results, and the sign of life when it is due."""
+        publisher, found = self._publisher, result.detections
+        for heatmap in result.heatmaps.values():
+            publisher.heatmap(heatmap)
+        publisher.detections(found.get("horizontal"), found.get("vertical"), result.cloud)
         if result.pose is not None:
             publisher.pose(result.pose)
-        self.tick("run")
+        self.report("RUN")
 
     def window(self, result: WindowResult) -> None:
         """Publish a fused window and its shapes."""
@@ -48,20 +46,49 @@ class PublishingSink:
         for shape in result.shapes:
             self._publisher.shape(shape)
 
-    def tick(self, state: str) -> None:
-        """Heartbeat and status when they are due."""
-        if self._is_due("heartbeat", HEARTBEAT_PERIOD_NS):
-            self._publisher.heartbeat(state)
-        if self._is_due("status", STATUS_PERIOD_NS):
-            self.status(state)
+    def report(self, state: State) -> None:
+        """Heartbeat and status, as far as they are due."""
+        self._publisher.heartbeat(state)
+        self._publisher.status(self._status(state))
 
-    def status(self, state: str) -> None:
-        """Publish the counters now."""
-        raise NotImplementedError
+    def _status(self, state: State) -> Status:
+        pipeline = self._pipeline
+        if pipeline is None:
+            return Status(state, LEVELS["OK"], versions={"rfconstruct": self._version})
+        uptime_s = time.monotonic() - self._start_s
+        accounts = {radar: ledger.snapshot() for radar, ledger in pipeline.ledgers.items()}
+        reasons = self._update_reasons(pipeline)
+        return Status(
+            state=state,
+            level=LEVELS["WARN"] if reasons else LEVELS["OK"],
+            reasons=reasons,
+            radars={
+                radar: RadarStatus(
+                    account.frames_in,
+                    account.frames_ok,
+                    {cause.value: count for cause, count in account.lost.items()},
+                    account.frames_ok / max(uptime_s, 1e-3),
+                )
+                for radar, account in accounts.items()
+            },
+            latency_us={s: (t.p50_us, t.p99_us, t.max_us) for s, t in pipeline.times.summary().items()},
+            system={"rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0},
+            versions={"rfconstruct": self._version},
+            uptime_s=uptime_s,
+        )
 
-    def _is_due(self, what: str, period_ns: int) -> bool:
+    def _update_reasons(self, pipeline: Pipeline) -> list[Reason]:
+        """One reason for every cause of loss and every fault that has occurred."""
+        counts: dict[str, int] = {}
+        for ledger in pipeline.ledgers.values():
+            for cause, count in ledger.snapshot().lost.items():
+                counts[cause.name] = counts.get(cause.name, 0) + count
+        counts["POSE_REFUSED"] = pipeline.faults.poses_refused
+        counts["SHAPE_WITHHELD"] = pipeline.faults.shapes_withheld
+        counts["DEAD_CHANNEL"] = sum(map(len, pipeline.faults.dead_channels.values()))
         now_ns = time.monotonic_ns()
-        if now_ns < self._due_ns[what]:
-            return False
-        self._due_ns[what] = now_ns + period_ns
-        return True
+        for code, count in counts.items():
+            before = self._reasons.get(code)
+            if count and (before is None or before[0] != count):
+                self._reasons[code] = (count, before[1] if before else now_ns, now_ns)
+        return [Reason(code, *facts) for code, facts in sorted(self._reasons.items())]

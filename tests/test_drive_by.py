@@ -73,7 +73,8 @@ def test_a_frame_depends_on_nothing_but_its_number() -> None:
     late = second.frame("vertical", 3)
     first.frame("horizontal", 0)
     np.testing.assert_array_equal(first.frame("vertical", 3).adc, late.adc)
-    assert late.t_first_chirp_ns == EPOCH_NS + round(3.5e9 * settings.frame_period_s)
+    half_period_s = 0.5 * rig.radars["vertical"].schedule.frame_period_s
+    assert late.t_first_chirp_ns == EPOCH_NS + round(1e9 * (3 * settings.frame_period_s + half_period_s))
     assert first.velocity_rig_m_s == pytest.approx([0.0, -settings.speed_m_s, 0.0], abs=1e-12)
 
 

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "rig": rig.name,
-        "frame": f"{layout.slots} TX x {layout.devices * layout.rx} RX x {layout.samples} samples, loops {layout.loops}",
+        "frame": f"{layout.slots} TX, {layout.devices * layout.rx} RX, {layout.samples} samples, {layout.loops} loops",
         "threads": 1,
     }
     if args.json:
@@ -107,11 +107,11 @@ def table(head: dict[str, Any], timings: dict[str, Timing]) -> list[str]:
     """Lines of the human-readable report."""
     lines = [f"{head['processor']}, one thread, Python {head['python']}, NumPy {head['numpy']}"]
     lines += [f"rig {head['rig']}: {head['frame']} per radar", ""]
-    lines += [f"{'':40s} {'median ms':>10s} {'p99 ms':>9s} {'ratio to ' + PEER:>24s}"]
+    lines += [f"{'':46s} {'median ms':>10s} {'p99 ms':>9s} {'ratio to ' + PEER:>24s}"]
     for name, timing in timings.items():
         peer = timings.get(f"{name} ({PEER})")
         ratio = f"{peer.median_ms / timing.median_ms:.1f} x faster" if peer else ""
-        lines.append(f"{name:40s} {timing.median_ms:10.3f} {timing.p99_ms:9.3f} {ratio:>24s}")
+        lines.append(f"{name:46s} {timing.median_ms:10.3f} {timing.p99_ms:9.3f} {ratio:>24s}")
     return lines
 
 

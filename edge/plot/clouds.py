@@ -51,10 +51,15 @@ def cloud_picture(path: Path, cloud: FusedCloud, horizontal: Float32, vertical: 
         _layer("Vertical radar alone (no azimuth: drawn straight ahead)", VERTICAL, vertical),
         _layer("Both, associated by power", BOTH, both),
     )
-    figure = new_figure(13.0, 11.5, "Fused window of travel, three sides", subtitle)
     limits = _limits([layer.xyz_m for layer in layers])
-    for row, layer in zip(figure.subplots(len(layers), len(SIDES)), layers, strict=True):
-        for axes, side in zip(row, SIDES, strict=True):
+    spans = [high - low for low, high in limits]
+    height_in = 1.0 + 3.0 * (0.9 + 4.0 * max(spans[0], spans[2]) / (2.0 * spans[1] + spans[0]))
+    figure = new_figure(13.0, min(height_in, 14.0), "Fused window of travel, three sides", subtitle)
+    rows = figure.subfigures(len(layers), 1)
+    for row, layer in zip(rows, layers, strict=True):
+        row.suptitle(layer.title, x=0.01, ha="left", fontsize=10, color=layer.colour, fontweight="bold")
+        views = row.subplots(1, len(SIDES), width_ratios=[spans[across] for _, across, _ in SIDES])
+        for axes, side in zip(views, SIDES, strict=True):
             _view(axes, layer, side, limits)
     return write(figure, path)
 
@@ -67,9 +72,9 @@ def _layer(title: str, colour: str, points: Float32) -> Layer:
 
 
 def _limits(clouds: Sequence[Float32]) -> list[tuple[float, float]]:
-    """Common limits of x, y, z over all layers, without the outermost percent."""
+    """Common limits of x, y, z over all layers, without the outermost few percent."""
     together = np.concatenate([c for c in clouds if len(c)] or [np.zeros((1, 3), dtype=np.float32)])
-    low, high = np.percentile(together, (0.5, 99.5), axis=0)
+    low, high = np.percentile(together, (2.0, 98.0), axis=0)
     return [(float(a) - 0.4, float(b) + 0.4) for a, b in zip(low, high, strict=True)]
 
 
@@ -79,7 +84,7 @@ def _view(axes: Any, layer: Layer, side: tuple[str, int, int], limits: list[tupl
         *(layer.xyz_m[:, across], layer.xyz_m[:, up]),
         s=5, c=layer.colour, alpha=layer.weight if len(layer.weight) else None, linewidths=0,
     )
-    dress(axes, f"{layer.title}\n{name}" if side is SIDES[0] else f"\n{name}", AXIS_LABEL[across], AXIS_LABEL[up])
+    dress(axes, name, AXIS_LABEL[across], AXIS_LABEL[up])
     axes.set_xlim(*limits[across])
     axes.set_ylim(*limits[up])
     axes.set_aspect("equal")

@@ -44,13 +44,15 @@ class PictureCollector:
             self._frames.append((result.pose, dict(result.detections)))
 
     def window(self, result: WindowResult) -> None:
-        """Keep the window with the most points, and the newest shape of every object."""
+        """Keep the window with the most points, and the most trusted shape of every object."""
         inside = [entry for entry in self._frames if entry[0].t_ns >= result.cloud.t_start_ns]
         if self._window is None or len(result.cloud) > len(self._window[0]):
             self._window = (result.cloud, [entry for entry in inside if entry[0].t_ns <= result.cloud.t_end_ns])
         self._frames = inside
         for shape in result.shapes:
-            self._shapes[shape.identity] = shape
+            known = self._shapes.get(shape.identity)
+            if known is None or shape.confidence >= known.confidence:
+                self._shapes[shape.identity] = shape
 
     def write(self) -> list[Path]:
         """Write all pictures that there is something for; returns their paths."""

@@ -11,6 +11,7 @@ from edge.errors import DependencyError
 INK, MUTED, GRID = "#1b1f24", "#6b7280", "#d9dde3"
 HORIZONTAL, VERTICAL, BOTH, INPUT, COARSE = "#1f6fb4", "#c8641b", "#1a7f5a", "#c0392b", "#7a4fb0"
 DPI = 130
+HEAD_IN = 0.7
 
 
 def new_figure(width_in: float, height_in: float, title: str, subtitle: str = "") -> Any:
@@ -28,10 +29,9 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str = ""
     except ImportError as error:
         raise DependencyError("pictures need matplotlib", action="pip install 'rfconstruct[plot]'") from error
     figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
-    head = figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=INK, fontweight="bold")
-    if subtitle:
-        head.set_text(f"{title}\n")
-        figure.text(0.01, 1.0 - 0.46 / height_in, subtitle, ha="left", va="center", fontsize=9, color=MUTED)
+    figure.get_layout_engine().set(rect=(0.0, 0.0, 1.0, 1.0 - HEAD_IN / height_in))
+    figure.text(0.01, 1.0 - 0.24 / height_in, title, ha="left", va="center", fontsize=13, color=INK, fontweight="bold")
+    figure.text(0.01, 1.0 - 0.48 / height_in, subtitle, ha="left", va="center", fontsize=9, color=MUTED)
     return figure
 
 

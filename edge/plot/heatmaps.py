@@ -12,13 +12,10 @@ import numpy as np
 from edge.frames import Detections, Float32, Heatmap, RadarId
 from edge.plot.figure import INK, MUTED, dress, new_figure, write
 
-DYNAMIC_RANGE_DB = 45.0
+DYNAMIC_RANGE_DB = 50.0
 SHOWN_COSINE = np.sin(np.radians(70.0))
 FIELD_OF_VIEW_COSINE = np.sin(np.radians(45.0))
-PLANE = {
-    "horizontal": ("Horizontal radar", "left  y (m)", "forward  x (m)"),
-    "vertical": ("Vertical radar", "up  z (m)", "forward  x (m)"),
-}
+NEAREST_LIMIT_M, FARTHEST_LIMIT_M = 5.0, 15.0
 
 
 def heatmap_picture(
@@ -26,55 +23,80 @@ def heatmap_picture(
     heatmaps: Mapping[RadarId, Heatmap],
     detections: Mapping[RadarId, Detections],
     subtitle: str,
-    max_range_m: float = 12.0,
 ) -> Path:
-    """Write the heatmaps of one frame side by side.
+    """Write the heatmaps of one frame: the horizontal radar from above, the vertical one from the side.
 
     Args:
         path: of the PNG.
         heatmaps, detections: radar id -> data of the same frame.
         subtitle: what was recorded, in one line.
-        max_range_m: farther cells are not drawn.
     """
     number = next(iter(heatmaps.values())).number
-    figure = new_figure(6.6 * len(heatmaps), 6.4, f"Range-angle heatmaps and CFAR detections, frame {number}", subtitle)
+    limit_m = _limit_m(detections)
+    width = 7.4 if len(heatmaps) == 1 else 12.6
+    figure = new_figure(width, 6.2, f"Range-angle heatmaps and CFAR detections, frame {number}", subtitle)
     for axes, (radar, heatmap) in zip(_row(figure, len(heatmaps)), heatmaps.items(), strict=True):
-        _panel(figure, axes, heatmap, detections[radar], max_range_m)
+        _panel(figure, axes, heatmap, detections[radar], limit_m)
     return write(figure, path)
 
 
+def _limit_m(detections: Mapping[RadarId, Detections]) -> float:
+    """Range up to which cells are drawn: somewhat beyond nearly all detections."""
+    ranges = np.concatenate([found.range_m for found in detections.values()])
+    reach_m = 1.5 * float(np.percentile(ranges, 90)) if len(ranges) else FARTHEST_LIMIT_M
+    return float(np.clip(reach_m, NEAREST_LIMIT_M, FARTHEST_LIMIT_M))
+
+
 def _row(figure: Any, count: int) -> list[Any]:
-    return list(np.atleast_1d(figure.subplots(1, count)).ravel())
+    ratios = [1.5, 1.0][:count]
+    return list(np.atleast_1d(figure.subplots(1, count, width_ratios=ratios)).ravel())
 
 
-def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, max_range_m: float) -> None:
-    name, lateral, forward = PLANE[heatmap.radar]
-    power_db, along_m, forward_m = _cartesian(heatmap, max_range_m)
+def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m: float) -> None:
+    from_above = heatmap.radar == "horizontal"
+    power_db, along_m, forward_m = _cartesian(heatmap, limit_m)
     top_db = float(power_db[:, heatmap.range_m[: power_db.shape[1]] > 1.0].max())
-    mesh = axes.pcolormesh(
-        *(along_m, forward_m, power_db),
-        cmap="magma", vmin=top_db - DYNAMIC_RANGE_DB, vmax=top_db, shading="nearest", rasterized=True,
-    )
-    shown = (found.range_m <= max_range_m) & (np.abs(found.direction_cosine) <= SHOWN_COSINE)
+    shown = (found.range_m <= limit_m) & (np.abs(found.direction_cosine) <= SHOWN_COSINE)
     r, u = found.range_m[shown], found.direction_cosine[shown]
-    axes.scatter(r * u, r * np.sqrt(1 - u**2), s=26, facecolors="none", edgecolors="#7ef0ff", linewidths=1.0)
-    for side in (-1.0, 1.0):
-        edge = max_range_m * side * FIELD_OF_VIEW_COSINE
-        axes.plot([0, edge], [0, abs(edge)], color="white", linewidth=0.7, linestyle=":", alpha=0.7)
-    dress(axes, f"{name}: {int(shown.sum())} detections shown, {len(found)} in all", lateral, forward)
+    edge_m = limit_m * FIELD_OF_VIEW_COSINE
+    corners, spots = (along_m, forward_m), (r * u, r * np.sqrt(1 - u**2))
+    rays = [((0.0, side * edge_m), (0.0, edge_m)) for side in (-1.0, 1.0)]
+    if not from_above:
+        corners, spots, rays = corners[::-1], spots[::-1], [ray[::-1] for ray in rays]
+    mesh = axes.pcolormesh(
+        *(*corners, power_db),
+        cmap="magma",
+        vmin=top_db - DYNAMIC_RANGE_DB,
+        vmax=top_db,
+        shading="flat",
+        rasterized=True,
+    )
+    axes.scatter(*spots, s=26, facecolors="none", edgecolors="#7ef0ff", linewidths=1.0)
+    for ray in rays:
+        axes.plot(*ray, color="white", linewidth=0.7, linestyle=":", alpha=0.7)
+    name = "Horizontal radar, from above" if from_above else "Vertical radar, from the side"
+    labels = ("left  y (m)", "forward  x (m)") if from_above else ("forward  x (m)", "up  z (m)")
+    dress(axes, f"{name}: {int(shown.sum())} of {len(found)} detections", *labels)
     axes.grid(False)
     axes.set_aspect("equal")
-    if heatmap.radar == "horizontal":
+    if from_above:
         axes.invert_xaxis()
-    bar = figure.colorbar(mesh, ax=axes, shrink=0.8, pad=0.01)
+    bar = figure.colorbar(mesh, ax=axes, shrink=0.7, pad=0.01, location="bottom" if from_above else "right")
     bar.set_label("power (dB over 1 LSB²)", fontsize=9, color=MUTED)
     bar.ax.tick_params(labelsize=8, colors=INK)
 
 
 def _cartesian(heatmap: Heatmap, max_range_m: float) -> tuple[Float32, Float32, Float32]:
-    """Power in dB and the position of every shown cell, [angle, range] each."""
+    """Power of every shown cell in dB, [angle, range], and the cells' corners, [angle + 1, range + 1] each."""
     angle = np.abs(heatmap.direction_cosine) <= SHOWN_COSINE
     last = max(2, int(np.searchsorted(heatmap.range_m, max_range_m)))
     power_db = 10.0 * np.log10(np.maximum(heatmap.power[angle, :last], 1e-6))
-    u, r = heatmap.direction_cosine[angle][:, None], np.maximum(heatmap.range_m[None, :last], 0.0)
+    u = np.clip(_edges(heatmap.direction_cosine[angle]), -1.0, 1.0)[:, None]
+    r = np.maximum(_edges(heatmap.range_m[:last]), 0.0)[None, :]
     return power_db, r * u, r * np.sqrt(1.0 - u**2)
+
+
+def _edges(centres: Float32) -> Float32:
+    """Borders between equally spaced cells."""
+    half = 0.5 * (centres[1] - centres[0])
+    return np.append(centres - half, centres[-1] + half)

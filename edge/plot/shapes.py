@@ -11,7 +11,8 @@ import numpy as np
 from edge.frames import Float32, Shape
 from edge.plot.figure import BOTH, COARSE, GRID, INK, INPUT, MUTED, new_figure, write
 
-VIEWS = (("three-quarter view", 22.0, -55.0), ("from above", 90.0, -90.0))
+TOP_DEG = 90.0
+VIEWS = (("three-quarter view", 22.0, -55.0), ("from above", TOP_DEG, -90.0))
 
 
 def shape_picture(path: Path, shape: Shape, subtitle: str, truth_m: Float32 | None = None) -> Path:
@@ -41,6 +42,9 @@ def shape_picture(path: Path, shape: Shape, subtitle: str, truth_m: Float32 | No
             axes.scatter(*points.T, s=size, c=colour, alpha=0.8, linewidths=0)
             _box(axes, low, high)
             axes.view_init(elevation, azimuth)
+            if elevation == TOP_DEG:
+                axes.set_zticks([])
+                axes.set_zlabel("")
             axes.set_title(name if row == 0 else view, fontsize=10, color=INK if row == 0 else MUTED)
     return write(figure, path)
 

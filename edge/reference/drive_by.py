@@ -33,7 +33,7 @@ class DriveBy:
 
     Args:
         frames: frames of each radar.
-        frame_period_s: time between two frames of one radar.
+        frame_period_s: time between two kept frames of one radar; a multiple of the schedule's period.
         speed_m_s: of the vehicle.
         lateral_m: distance between the radars' track and the nearest point of the object.
         scatterers: point scatterers on the whole surface; about half of them are hidden at any time.
@@ -44,11 +44,11 @@ class DriveBy:
 
     frames: int = 60
     frame_period_s: float = 0.1
-    speed_m_s: float = 0.52
+    speed_m_s: float = 3.0 / 5.9
     lateral_m: float = 3.0
     scatterers: int = 500
-    reference_power_db: float = 62.0
-    noise_lsb: float = 12.0
+    reference_power_db: float = 58.0
+    noise_lsb: float = 25.0
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -155,7 +155,7 @@ class DriveByScene:
     """The rig drives past an object; any frame of any radar can be asked for, always with the same samples.
 
     Args:
-        radars: radar id -> board; the vertical one fires half a period after the horizontal one.
+        radars: radar id -> board; the vertical one fires half its schedule's period after the horizontal one.
         geometry: height and yaw of the rig.
         antenna: element pattern, applied to the direction of each scatterer from the rig.
         vertices_m, faces: the object in the odometry frame, see ``place``.
@@ -186,7 +186,8 @@ class DriveByScene:
     def frame(self, radar: RadarId, number: int) -> RadarFrame:
         """Raw frame ``number`` of one radar."""
         settings, points = self.settings, self._scatterers
-        delay_s = 0.5 * settings.frame_period_s if radar == "vertical" and len(self.radars) > 1 else 0.0
+        late = radar == "vertical" and len(self.radars) > 1
+        delay_s = 0.5 * self.radars[radar].schedule.frame_period_s if late else 0.0
         time_s = number * settings.frame_period_s + delay_s
         eye_m = np.array([settings.speed_m_s * time_s, 0.0, self._height_m])
         seen = visible(points, self._surface, eye_m)

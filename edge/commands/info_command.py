@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rfconstruct info``: describes a recording, a rig (with every hardware rule) or a model folder."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from edge.completion.manifest import find_model, read_files, read_manifest
+from edge.constraints import format_table
+from edge.errors import ConfigError, ExitCode
+from edge.recording.reader import RecordingReader
+from edge.rig import Rig, known_rigs, load_rig
+from edge.waveform import Schedule
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument("target", help="recording (.mcap), rig name or folder, model name or folder")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Find out what the target is and describe it."""
+    path = Path(args.target)
+    if path.is_file():
+        content = RecordingReader(path).info()
+        print(json.dumps(content, indent=2, default=str) if args.json else "\n".join(pairs(content)))
+        return ExitCode.OK
+    if (path / "manifest.json").is_file() or (args.target not in known_rigs() and _is_model(args.target)):
+        content = describe_model(path if path.is_dir() else find_model(args.target))
+        print(json.dumps(content, indent=2) if args.json else "\n".join(pairs(content)))
+        return ExitCode.OK
+    rig = load_rig(args.target)
+    print(json.dumps(rig_as_dict(rig), indent=2) if args.json else "\n".join(describe_rig(rig)))
+    return ExitCode.OK
+
+
+def _is_model(name: str) -> bool:
+    try:
+        return (find_model(name) / "manifest.json").is_file()
+    except (ConfigError, FileNotFoundError):
+        return False
+
+
+def describe_model(folder: Path) -> dict[str, Any]:
+    """Manifest of a model folder after its files were checked against their hashes."""
+    manifest = read_manifest(folder)
+    read_files(folder, manifest)
+    return {
+        "model": manifest.name,
+        "files": {f.file: f"{f.precision}, {f.size / 1e6:.2f} MB, sha256 {f.sha256}" for f in manifest.files.values()},
+        "default file": manifest.default_file,
+        "classes": list(manifest.classes),
+        "rigs": list(manifest.rigs),
+    }
+
+
+def schedule_figures(schedule: Schedule) -> dict[str, tuple[float, str]]:
+    """Derived quantities of one radar: name -> (value, unit)."""
+    profile = schedule.profile
+    return {
+        "range bin": (100 * profile.range_bin_m, "cm"),
+        "largest range": (profile.max_range_m, "m"),
+        "centre frequency": (profile.center_frequency_hz / 1e9, "GHz"),
+        "bandwidth": (profile.bandwidth_hz / 1e9, "GHz"),
+        "burst": (1e3 * schedule.burst_s, "ms"),
+        "frame period": (1e3 * schedule.frame_period_s_actual, "ms"),
+        "largest speed": (schedule.max_speed_m_s, "m/s"),
+        "speed bin": (schedule.speed_bin_m_s, "m/s"),
+        "frame": (schedule.frame_bytes / 1e6, "MB"),
+        "data rate": (schedule.data_rate_bytes_s / 1e6, "MB/s"),
+    }
+
+
+def describe_rig(rig: Rig) -> list[str]:
+    """Lines for people: radars with derived figures, then every rule with formula, measured value and limit."""
+    lines = [f"rig {rig.name}: {rig.description}", ""]
+    for name, radar in rig.radars.items():
+        layout = radar.schedule.layout
+        lines.append(f"{name}: {radar.schedule.profile.device}, {layout.slots} TX x {layout.devices * layout.rx} RX")
+        lines += [f"  {key:<18}{value:10.4g} {unit}" for key, (value, unit) in schedule_figures(radar.schedule).items()]
+    lines += ["", format_table(rig.constraints())]
+    return lines
+
+
+def rig_as_dict(rig: Rig) -> dict[str, Any]:
+    """The same for machines."""
+    figures = {
+        radar: {key: {"value": value, "unit": unit} for key, (value, unit) in schedule_figures(r.schedule).items()}
+        for radar, r in rig.radars.items()
+    }
+    rules = [asdict(rule) for rule in rig.constraints()]
+    return {"rig": rig.name, "config": rig.config_hash.hex(), "radars": figures, "rules": rules}
+
+
+def pairs(content: dict[str, Any], indent: int = 0) -> Sequence[str]:
+    """``key  value`` lines of nested dictionaries."""
+    lines: list[str] = []
+    for key, value in content.items():
+        if isinstance(value, dict):
+            lines += [f"{' ' * indent}{key}:", *pairs(value, indent + 2)]
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
+            lines.append(f"{' ' * indent}{key:<22} {text}")
+    return lines

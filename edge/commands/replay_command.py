@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rfconstruct replay``: plays a recording or a capture folder through the whole pipeline."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+
+from edge.commands import session
+from edge.commands.open_source import add_rig_arguments, calibrated, open_capture, rig_of
+from edge.errors import ExitCode, RecordingError
+from edge.recording.reader import RecordingReader
+from edge.rig import load_rig
+from edge.sources.base import FrameSource
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument("recording", type=Path, help="MCAP recording, or a folder of one radar's capture files")
+    add_rig_arguments(parser)
+    session.add_arguments(parser, speed="1")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Open, play, report; exit code 3 when frames were lost."""
+    path: Path = args.recording
+    if not path.exists():
+        raise RecordingError(f"{path}: no such recording", action="give an .mcap file or a capture folder")
+    if path.is_dir():
+        rig = rig_of(args)
+        source, notes = open_capture(path, rig)
+        return _play(args, session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), source)
+    with RecordingReader(path) as reader:
+        rig = calibrated(load_rig(args.rig) if args.rig else reader.read_rig(), args.calibration)
+        notes = [f"{path}: its end is missing; played up to the last whole record"] if reader.truncated else []
+        return _play(args, session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), reader)
+
+
+def _play(args: argparse.Namespace, run: session.Session, source: FrameSource) -> int:
+    with closing(source):
+        pictures = run.run(source, source.total_frames)
+    run.report(pictures)
+    lost = sum(ledger.snapshot().frames_lost for ledger in run.pipeline.ledgers.values())
+    return ExitCode.DEGRADED if lost else ExitCode.OK

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run prints when it is over: the account of frames, latencies, objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from edge.frames import Shape
+from edge.pipeline import FrameResult, Pipeline, WindowResult
+
+
+class Tally:
+    """A sink that counts results and keeps the most trusted shape of every object."""
+
+    def __init__(self) -> None:
+        self.detections: dict[str, int] = {}
+        self.points = self.windows = 0
+        self.shapes: dict[int, Shape] = {}
+
+    def frame(self, result: FrameResult) -> None:
+        """Count one frame's results."""
+        for radar, found in result.detections.items():
+            self.detections[radar] = self.detections.get(radar, 0) + len(found)
+        self.points += len(result.cloud) if result.cloud is not None else 0
+
+    def window(self, result: WindowResult) -> None:
+        """Count a window, keep its shapes."""
+        self.windows += 1
+        for shape in result.shapes:
+            known = self.shapes.get(shape.identity)
+            if known is None or shape.confidence >= known.confidence:
+                self.shapes[shape.identity] = shape
+
+
+def shape_as_dict(shape: Shape) -> dict[str, Any]:
+    """A shape without its points."""
+    extent = shape.fine_m.max(axis=0) - shape.fine_m.min(axis=0)
+    return {
+        "object": shape.identity,
+        "class": shape.class_name,
+        "class_probability": shape.class_probability,
+        "confidence": shape.confidence,
+        "size_m": [round(float(side), 3) for side in extent],
+        "input_points": len(shape.input),
+        "frames": shape.input.frames,
+        "travel_m": shape.input.travel_m,
+    }
+
+
+def as_dict(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: Sequence[str]) -> dict[str, Any]:
+    """The whole report for machines."""
+    return {
+        "rig": pipeline.rig.name,
+        "frames": {radar: ledger.snapshot().as_dict() for radar, ledger in pipeline.ledgers.items()},
+        "detections": tally.detections,
+        "points": tally.points,
+        "windows": tally.windows,
+        "shapes": [shape_as_dict(shape) for _, shape in sorted(tally.shapes.items())],
+        "stages": {stage: asdict(time) for stage, time in pipeline.times.summary().items()},
+        "faults": asdict(pipeline.faults),
+        "pictures": [str(path) for path in pictures],
+        "notes": list(notes),
+    }
+
+
+def lines(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: Sequence[str]) -> list[str]:
+    """The whole report for people."""
+    text = [f"{'radar':<12}{'frames in':>10}{'ok':>8}{'lost':>8}  causes"]
+    for radar, ledger in pipeline.ledgers.items():
+        account = ledger.snapshot()
+        causes = ", ".join(f"{cause.value} {count}" for cause, count in account.lost.items())
+        text.append(f"{radar:<12}{account.frames_in:>10}{account.frames_ok:>8}{account.frames_lost:>8}  {causes}")
+    text += ["", f"{'stage':<12}{'calls':>10}{'p50 ms':>10}{'p99 ms':>10}"]
+    for stage, time in pipeline.times.summary().items():
+        text.append(f"{stage:<12}{time.count:>10}{time.p50_us / 1e3:>10.3f}{time.p99_us / 1e3:>10.3f}")
+    found = ", ".join(f"{radar} {count}" for radar, count in tally.detections.items())
+    text += ["", f"detections: {found}; associated points: {tally.points}; windows: {tally.windows}"]
+    text += [_shape_line(shape) for _, shape in sorted(tally.shapes.items())]
+    text += [f"dead channels of {radar}: {', '.join(names)}" for radar, names in _dead(pipeline).items()]
+    if pipeline.faults.last:
+        text.append(f"last fault: {pipeline.faults.last}")
+    text += [f"note: {note}" for note in notes]
+    text += [f"picture: {path}" for path in pictures]
+    return text
+
+
+def _dead(pipeline: Pipeline) -> dict[str, tuple[str, ...]]:
+    return {radar: names for radar, names in pipeline.faults.dead_channels.items() if names}
+
+
+def _shape_line(shape: Shape) -> str:
+    facts = shape_as_dict(shape)
+    size = " x ".join(f"{side:.2f}" for side in facts["size_m"])
+    probability = shape.class_probability.get(shape.class_name, 0.0)
+    return (
+        f"object {shape.identity}: {shape.class_name} (p {probability:.2f}, confidence {shape.confidence:.2f}), "
+        f"{size} m, from {len(shape.input)} radar points of {shape.input.frames} frames"
+    )

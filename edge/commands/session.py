@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``replay`` and ``demo`` share: model, publisher, pictures and pipeline put together, played, reported."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edge.commands.report import Tally, as_dict, lines
+from edge.completion.manifest import find_model
+from edge.completion.model import CompletionModel
+from edge.frames import RADARS, Float32, Pose, RadarFrame
+from edge.pipeline import Pipeline, Sink
+from edge.player import play
+from edge.plot.collector import PictureCollector
+from edge.publish import PublishingSink
+from edge.rig import Rig
+from edge.sources.base import Loss
+from edge.stream.publisher import Publisher
+from edge.stream.wire import Source
+from edge.version import version
+
+
+def add_arguments(parser: argparse.ArgumentParser, speed: str) -> None:
+    """Options that both verbs have."""
+    parser.add_argument(
+        "--speed", default=speed, help="1 = as recorded, 2 = twice as fast, max = as fast as it goes (%(default)s)"
+    )
+    parser.add_argument("--plot", type=Path, metavar="DIR", help="write pictures there (extra 'plot')")
+    parser.add_argument("--endpoint", action="append", metavar="ADDRESS", help="publish there instead of the rig's")
+    parser.add_argument("--no-publish", action="store_true", help="publish nothing")
+
+
+def parse_speed(text: str) -> float:
+    """``max`` is 0: no waiting.
+
+    Raises:
+        argparse.ArgumentTypeError: neither ``max`` nor a positive number.
+    """
+    if text == "max":
+        return 0.0
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = -1.0
+    if not 0.0 < speed < 1e6:
+        raise argparse.ArgumentTypeError(f"speed {text!r}: give a positive number, or max")
+    return speed
+
+
+def load_model(rig: Rig) -> tuple[CompletionModel | None, list[str]]:
+    """The rig's model and what to say about it; a rig of one radar has no 3-D points and needs none."""
+    if len(rig.radars) < len(RADARS):
+        return None, ["one radar alone sees no height: heatmaps and detections only, no 3-D points and no shapes"]
+    settings = rig.settings.completion
+    model = CompletionModel.load(find_model(settings.model), settings)
+    if not model.valid_for(rig.name):
+        known = ", ".join(model.manifest.rigs)
+        return None, [f"model {model.manifest.name} is not made for rig {rig.name} (only {known}): points, no shapes"]
+    return model, []
+
+
+class Session:
+    """One run of a source through the pipeline.
+
+    Args:
+        rig: whose frames they are.
+        args: parsed options of ``add_arguments``.
+        source_kind: what the stream says its data are.
+        title: line under every picture's title.
+        notes: what a reader of the results should know.
+        truth_odom_m: float32 [n, 3] of the true object, simulated scenes only.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        args: argparse.Namespace,
+        source_kind: Source,
+        title: str,
+        notes: Sequence[str] = (),
+        truth_odom_m: Float32 | None = None,
+    ) -> None:
+        self.rig, self.tally, self.notes = rig, Tally(), list(notes)
+        self._args, self._speed = args, parse_speed(args.speed)
+        self._stack = ExitStack()
+        model, more = load_model(rig)
+        self.notes += more
+        sinks: list[Sink] = [self.tally]
+        self._publishing: PublishingSink | None = None
+        if not args.no_publish:
+            self._publishing = self._publisher(source_kind)
+            sinks.append(self._publishing)
+        self._pictures: PictureCollector | None = None
+        if args.plot is not None:
+            self._pictures = PictureCollector(args.plot, title, truth_odom_m)
+            sinks.append(self._pictures)
+        self.pipeline = Pipeline(rig, model, sinks)
+        if self._publishing is not None:
+            self._publishing.watch(self.pipeline)
+
+    def _publisher(self, kind: Source) -> PublishingSink:
+        settings = self.rig.settings.stream
+        if self._args.endpoint:
+            settings = replace(settings, endpoints=tuple(self._args.endpoint))
+        publisher = Publisher(settings, self.rig.config_hash, self.rig.calibration_hash, kind)
+        self._stack.callback(publisher.close)
+        if not self._args.json:
+            print(f"publishing on {', '.join(publisher.endpoints)}", flush=True)
+        return PublishingSink(publisher, version())
+
+    def run(self, source: Iterable[RadarFrame | Pose | Loss], total: int | None) -> list[Path]:
+        """Play the source to its end; returns the pictures that were written."""
+        with self._stack:
+            play(source, self.pipeline, self._speed, total, show_progress=not self._args.json)
+            if self._publishing is not None:
+                self._publishing.report("STOP")
+        return self._pictures.write() if self._pictures is not None else []
+
+    def report(self, pictures: Sequence[Path], extra: dict[str, Any] | None = None) -> None:
+        """Print the account on stdout."""
+        if self._args.json:
+            content = {**as_dict(self.pipeline, self.tally, pictures, self.notes), **(extra or {})}
+            print(json.dumps(content, indent=2))
+            return
+        print("\n".join(lines(self.pipeline, self.tally, pictures, self.notes)))
+        for key, value in (extra or {}).items():
+            print(f"{key.replace('_', ' ')}: {value}")
