@@ -1,0 +1,413 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publisher and client over real sockets: losses, restarts, hostile bytes, addresses."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+from stream_samples import STAMP, detections, fused_cloud, heatmap, point_cloud, pose, shape, status
+
+from edge import connect
+from edge.config import StreamSettings
+from edge.errors import ConfigError, ExitCode
+from edge.stream.client import Client
+from edge.stream.convert import encode_heartbeat, encode_pose
+from edge.stream.messages import HeartbeatMessage, PoseMessage, ShapeMessage, StatusMessage
+from edge.stream.publisher import Publisher, _Pace, checked_endpoint
+from edge.stream.wire import join, pack, split
+
+LOCAL = StreamSettings(("tcp://127.0.0.1:*",))
+WAIT_S = 20.0
+"""Upper bound of waits that normally take milliseconds."""
+
+
+def publisher(settings: StreamSettings = LOCAL) -> Publisher:
+    return Publisher(settings, b"configuration", b"calibration", "sim")
+
+
+def subscribed(sender: Publisher, *topics: str, latest: bool = False) -> Client:
+    """A client whose subscription has reached the publisher."""
+    client = connect(sender.endpoints[0], topics=topics, timeout_s=WAIT_S, latest=latest)
+    deadline = time.monotonic() + WAIT_S
+    while not client.alive and time.monotonic() < deadline:
+        sender.heartbeat()
+        time.sleep(0.005)
+    assert client.alive
+    return client
+
+
+class Raw:
+    """A bare PUB socket, to send what a publisher never would."""
+
+    def __init__(self) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.PUB)
+        self._socket.bind("tcp://127.0.0.1:*")
+        self.endpoints = (self._socket.getsockopt_string(zmq.LAST_ENDPOINT),)
+        self._beats = 0
+
+    def heartbeat(self) -> None:
+        self.send(pack(encode_heartbeat("RUN", 1), replace(STAMP, sequence=self._beats)))
+        self._beats += 1
+
+    def send(self, frames: list[bytes]) -> None:
+        self._socket.send_multipart(frames)
+
+    def pose(self, sequence: int, boot: bytes = STAMP.boot) -> None:
+        self.send(pack(encode_pose(pose()), replace(STAMP, sequence=sequence, boot=boot)))
+
+    def close(self) -> None:
+        self._socket.close(linger=0)
+        self._context.term()
+
+
+@pytest.fixture
+def raw() -> Iterator[Raw]:
+    sender = Raw()
+    yield sender
+    sender.close()
+
+
+def poses(client: Client, count: int) -> list[int]:
+    """Sequence numbers of the next ``count`` poses."""
+    found: list[int] = []
+    while len(found) < count:
+        message = client.recv(WAIT_S)
+        assert message is not None
+        if isinstance(message, PoseMessage):
+            found.append(message.header.sequence)
+    return found
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+def test_every_kind_of_message_arrives(transport: str, tmp_path: Path) -> None:
+    settings = LOCAL if transport == "tcp" else StreamSettings((f"ipc://{tmp_path}/pub",))
+    with publisher(settings) as sender, subscribed(sender) as client:
+        sent = [
+            sender.shape(shape(16384)),
+            sender.cloud(fused_cloud()),
+            sender.heatmap(heatmap("horizontal")),
+            sender.heatmap(heatmap("vertical")),
+            sender.detections(detections("horizontal"), detections("vertical"), point_cloud()),
+            sender.pose(pose()),
+            sender.status(status()),
+        ]
+        names = [type(m).__name__ for m in client_messages(client, len(sent))]
+    assert names == [
+        "ShapeMessage",
+        "CloudMessage",
+        "HeatmapMessage",
+        "HeatmapMessage",
+        "DetectionsMessage",
+        "PoseMessage",
+        "StatusMessage",
+    ]
+    assert all(split(join(frames)) == frames for frames in sent)
+
+
+def client_messages(client: Client, count: int) -> list[object]:
+    """The next messages that are no heartbeats."""
+    found: list[object] = []
+    for message in client:
+        if not isinstance(message, HeartbeatMessage):
+            found.append(message)
+        if len(found) == count:
+            break
+    return found
+
+
+def test_shape_arrives_bit_for_bit_and_sequences_count_by_topic() -> None:
+    with publisher() as sender, subscribed(sender, "shape") as client:
+        car = shape(16384)
+        for item in (car, replace(car, class_name="bicycle"), car):
+            sender.shape(item)
+        got = client_messages(client, 3)
+    assert all(isinstance(m, ShapeMessage) for m in got)
+    assert [(m.header.topic, m.header.sequence) for m in got if isinstance(m, ShapeMessage)] == [
+        ("1/shape/car/", 0),
+        ("1/shape/bicycle/", 0),
+        ("1/shape/car/", 1),
+    ]
+    assert isinstance(got[0], ShapeMessage)
+    np.testing.assert_array_equal(got[0].fine_m, car.fine_m)
+    assert got[0].header.config_hash == b"configur"
+    assert client.lost == {}
+
+
+def test_only_asked_topics_are_given_but_life_is_known() -> None:
+    with publisher() as sender, subscribed(sender, "pose", "heat/vertical") as client:
+        sender.shape(shape())
+        sender.heatmap(heatmap("horizontal"))
+        sender.heatmap(heatmap("vertical"))
+        sender.pose(pose())
+        topics = [m.header.topic for m in client_messages(client, 2)]  # type: ignore[attr-defined]
+        assert topics == ["1/heat/vertical/", "1/pose/"]
+        assert client.alive
+
+
+def test_gaps_are_counted_by_topic(raw: Raw) -> None:
+    with subscribed(raw, "pose") as client:  # type: ignore[arg-type]
+        for sequence in (5, 6, 9, 10, 15):
+            raw.pose(sequence)
+        assert poses(client, 5) == [5, 6, 9, 10, 15]
+        assert client.lost == {"1/pose/": 6}
+        assert client.restarts == 0
+
+
+@pytest.mark.parametrize(("sequence", "boot"), [(50, b"another boot 16b"), (0, STAMP.boot)])
+def test_a_restart_is_no_loss(raw: Raw, sequence: int, boot: bytes) -> None:
+    with subscribed(raw, "pose") as client:  # type: ignore[arg-type]
+        for number in (3, 4):
+            raw.pose(number)
+        for number in (sequence, sequence + 1, sequence + 3):
+            raw.pose(number, boot)
+        poses(client, 5)
+        assert client.restarts == 1
+        assert client.lost == {"1/pose/": 1}
+
+
+def test_client_finds_a_restarted_publisher(tmp_path: Path) -> None:
+    settings = StreamSettings((f"ipc://{tmp_path}/pub",))
+    sender = publisher(settings)
+    client = subscribed(sender, "pose")
+    for _ in range(3):
+        sender.pose(pose())
+    poses(client, 3)
+    sender.close()
+    with client, publisher(settings) as again:
+        deadline = time.monotonic() + WAIT_S
+        message = None
+        while message is None and time.monotonic() < deadline:
+            again.pose(pose())
+            message = client.recv(0.02)
+        assert isinstance(message, PoseMessage)
+        assert client.restarts == 1
+        assert client.lost == {}
+
+
+def test_garbage_is_counted_and_the_next_message_is_fine(raw: Raw) -> None:
+    good = pack(encode_pose(pose()), STAMP)
+    with subscribed(raw) as client:  # type: ignore[arg-type]
+        for frames in ([b"1/pose/"], [b"1/pose/", b"\xc1"], [b"", b""], [good[0], good[1][:-1]], [b"x"] * 30):
+            raw.send(frames)
+        future = pack(replace(encode_pose(pose()), type="weather", topic="1/weather/"), STAMP)
+        raw.send(future)
+        raw.send(good)
+        assert poses(client, 1) == [7]
+        assert client.malformed == 5
+        assert client.ignored == 1
+
+
+def test_latest_gives_only_the_newest_of_each_topic(raw: Raw) -> None:
+    with subscribed(raw, "pose", latest=True) as client:  # type: ignore[arg-type]
+        for number in range(10):
+            raw.pose(number)
+        got = poses(client, 1)
+        while got[-1] != 9:
+            got += poses(client, 1)
+        assert len(got) + client.skipped == 10
+        assert client.lost == {}
+
+
+def test_a_stuck_subscriber_holds_nobody_up() -> None:
+    count, item = 300, shape(16384)
+    with publisher() as sender, subscribed(sender, "shape") as stuck, subscribed(sender, "shape") as reader:
+        received = 0
+        for _ in range(count):
+            sender.shape(item)
+            received += reader.recv(0.5) is not None
+        got = 0
+        while stuck.recv(0.2) is not None:
+            got += 1
+    assert received > 0.9 * count
+    assert 0 < got < count
+
+
+def test_hostile_bytes_on_the_port_change_nothing() -> None:
+    with publisher() as sender, subscribed(sender, "pose") as client:
+        port = int(sender.endpoints[0].rsplit(":", 1)[1])
+        for content in (os.urandom(100_000), b"GET / HTTP/1.1\r\n\r\n", b"\xff" + bytes(8) + b"\x7f" + bytes(60)):
+            hostile = socket.create_connection(("127.0.0.1", port))
+            with hostile, contextlib.suppress(ConnectionError):
+                hostile.sendall(content)
+        sender.pose(pose())
+        assert poses(client, 1) == [0]
+
+
+def test_heartbeats_and_their_rate(raw: Raw) -> None:
+    with subscribed(raw) as client:  # type: ignore[arg-type]
+        assert not client.frequency_ok
+        for rate_hz, fine in ((10.0, True), (9.1, True), (8.0, False)):
+            boot = os.urandom(16)
+            for number in range(12):
+                stamp = replace(STAMP, sequence=number, boot=boot, t_pub_ns=round(number * 1e9 / rate_hz))
+                raw.send(pack(encode_heartbeat("RUN", 1), stamp))
+            for _ in range(12):
+                message = client.recv(WAIT_S)
+                while message is not None and message.header.boot != boot:
+                    message = client.recv(WAIT_S)
+            assert client.frequency_ok is fine
+    assert not client.alive
+
+
+@pytest.mark.parametrize(("frames_hz", "expected"), [(60.0, 100), (10.0, 100), (25.0, 100), (4.0, 40)])
+def test_pace_keeps_its_mean_rate(frames_hz: float, expected: int) -> None:
+    pace = _Pace(10.0)
+    passed = sum(pace.due(round(number * 1e9 / frames_hz)) for number in range(round(10 * frames_hz)))
+    assert abs(passed - expected) <= 1
+    assert pace.due(0)
+    assert not pace.due(1)
+
+
+def test_heatmaps_are_thinned_by_measurement_time() -> None:
+    with publisher() as sender:
+        sent = [bool(sender.heatmap(heatmap("vertical", t_ns=number * 16_666_667))) for number in range(60)]
+        assert sum(sent) == 10
+        assert sender.heatmap(heatmap("horizontal"))
+
+
+def test_status_is_sent_at_once_when_it_changes() -> None:
+    with publisher() as sender:
+        assert sender.status(status())
+        assert not sender.status(replace(status(), uptime_s=13.0))
+        assert sender.status(replace(status(), reasons=()))
+        assert sender.status(status())
+
+
+def test_several_threads_may_publish() -> None:
+    with publisher() as sender, subscribed(sender, "pose") as client:
+        threads = [threading.Thread(target=lambda: [sender.pose(pose()) for _ in range(4)]) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert poses(client, 16) == list(range(16))
+
+
+def test_close_lets_the_last_message_out() -> None:
+    sender = publisher()
+    with subscribed(sender, "shape") as client:
+        sender.shape(shape(16384))
+        sender.close()
+        assert isinstance(client.recv(WAIT_S), ShapeMessage)
+
+
+def test_nobody_there_is_no_error_and_no_hang() -> None:
+    with connect("tcp://127.0.0.1:1", timeout_s=0.01) as client:
+        assert list(client) == []
+        assert client.recv(0.0) is None
+        assert not client.alive
+        assert not client.frequency_ok
+    assert client.recv(1.0) is None
+    with pytest.raises(ConfigError, match="connect"):
+        connect("carrier pigeon")
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp://127.0.0.1:5600", "tcp://[::1]:1", "tcp://127.0.0.9:*", "ipc:///run/rfc/pub"]
+)
+def test_addresses_of_this_machine(endpoint: str) -> None:
+    assert checked_endpoint(endpoint) == endpoint
+    assert checked_endpoint("tcp://localhost:5600") == "tcp://127.0.0.1:5600"
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp://0.0.0.0:5600",
+        "tcp://*:5600",
+        "tcp://192.168.0.2:5600",
+        "tcp://[::]:5600",
+        "tcp://eth0:5600",
+        "tcp://127.0.0.1",
+        "tcp://127.0.0.1:99999",
+        "tcp://127.0.0.1:5600;tcp://0.0.0.0:1",
+        "tcp://localhost.example.org:5600",
+        "tcp://[::ffff:10.0.0.1]:5600",
+        "udp://127.0.0.1:5600",
+        "inproc://x",
+        "ipc://",
+        "ipc://" + "x" * 108,
+        "",
+    ],
+)
+def test_other_addresses_are_refused(endpoint: str) -> None:
+    with pytest.raises(ConfigError, match=r"stream\.endpoints") as caught:
+        publisher(StreamSettings((endpoint,)))
+    assert caught.value.exit_code == ExitCode.BAD_CONFIG
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ipc", "abstract"])
+def test_an_address_in_use_is_refused_and_stays_with_its_owner(transport: str, tmp_path: Path) -> None:
+    named = {"tcp": LOCAL.endpoints[0], "ipc": f"ipc://{tmp_path}/pub", "abstract": f"ipc://@rfc-{os.getpid()}"}
+    with publisher(StreamSettings((named[transport],))) as owner:
+        taken = owner.endpoints[0] if transport == "tcp" else named[transport]
+        with pytest.raises(ConfigError, match="stop the other publisher"):
+            publisher(StreamSettings((taken,)))
+        with subscribed(owner, "pose") as client:
+            owner.pose(pose())
+            assert poses(client, 1) == [0]
+
+
+def test_a_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="folder"):
+        publisher(StreamSettings((f"ipc://{tmp_path}/none/pub",)))
+
+
+@pytest.mark.parametrize("values", [{"endpoints": ()}, {"send_high_water_mark": 0}, {"shape_encoding": "f8"}])
+def test_settings_are_checked(values: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(values))):
+        replace(LOCAL, **values)  # type: ignore[arg-type]
+
+
+def test_hashes_and_source_are_checked() -> None:
+    with pytest.raises(ConfigError, match="config_hash"):
+        Publisher(LOCAL, b"short", b"calibration", "sim")
+    with pytest.raises(ConfigError, match="source"):
+        Publisher(LOCAL, bytes(8), bytes(8), "dream")  # type: ignore[arg-type]
+
+
+def test_small_encodings_travel() -> None:
+    with publisher(replace(LOCAL, shape_encoding="i2")) as sender, subscribed(sender, "shape") as client:
+        sender.shape(shape(16384))
+        message = client.recv(WAIT_S)
+        assert isinstance(message, ShapeMessage)
+        np.testing.assert_allclose(message.fine_m, shape(16384).fine_m, atol=0.501e-3)
+
+
+def test_importing_edge_loads_no_zeromq() -> None:
+    code = "import edge, sys; assert 'zmq' not in sys.modules; edge.connect; assert 'zmq' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_example_prints_shapes() -> None:
+    example = Path(__file__).resolve().parents[2] / "examples" / "print_shapes.py"
+    with publisher() as sender:
+        process = subprocess.Popen(
+            [sys.executable, str(example), sender.endpoints[0]], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        first, done = process.stdout.readline(), threading.Event()
+        thread = threading.Thread(target=lambda: [sender.shape(shape()) for _ in iter(lambda: done.wait(0.05), True)])
+        thread.start()
+        line = process.stdout.readline()
+        done.set()
+        thread.join()
+        process.terminate()
+        process.communicate()
+    assert "waiting for shapes" in first
+    assert "object   5  car" in line
+    assert "size 1.50 x 2.00 x 1.50 m" in line
+    assert StatusMessage.__doc__
