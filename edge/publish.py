@@ -77,7 +77,7 @@ class PublishingSink:
             uptime_s=uptime_s,
         )
 
-    def _update_reasons(self, pipeline: Pipeline) -> list[Reason]:
+    def _update_reasons(self, pipeline: Pipeline) -> tuple[Reason, ...]:
         """One reason for every cause of loss and every fault that has occurred."""
         counts: dict[str, int] = {}
         for ledger in pipeline.ledgers.values():
@@ -91,4 +91,4 @@ class PublishingSink:
             before = self._reasons.get(code)
             if count and (before is None or before[0] != count):
                 self._reasons[code] = (count, before[1] if before else now_ns, now_ns)
-        return [Reason(code, *facts) for code, facts in sorted(self._reasons.items())]
+        return tuple(Reason(code, *facts) for code, facts in sorted(self._reasons.items()))

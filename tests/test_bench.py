@@ -28,7 +28,7 @@ def test_the_peer_makes_the_same_heatmap_and_detections(radar: RadarId) -> None:
     heatmap = Imager(board, settings.heatmap, settings.antenna).process(frame)
     power = NumpyImager(board, settings.heatmap, settings.antenna).process(frame)
     np.testing.assert_allclose(power, heatmap.power, rtol=2e-3, atol=1e-5 * float(power.max()))
-    cfar = replace(settings.cfar, p_fa=1e-4)
+    cfar = replace(settings.cfar, kind="ca", p_fa=1e-4)
     detector = Detector(board, cfar)
     first = int(np.searchsorted(heatmap.range_m, cfar.min_range_m))
     ours = detector.decisions(heatmap)

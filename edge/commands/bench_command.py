@@ -61,28 +61,30 @@ def run(args: argparse.Namespace) -> int:
 def calls(rig: Rig) -> dict[str, Callable[[], object]]:
     """Name of a measured call -> the call; a peer's name ends in "(numpy float32)"."""
     settings, frames = rig.settings, _frames(rig)
+    cfar = replace(settings.cfar, kind="ca")
     imagers = {r: Imager(rig.radars[r], settings.heatmap, settings.antenna) for r in RADARS}
     peers = {r: NumpyImager(rig.radars[r], settings.heatmap, settings.antenna) for r in RADARS}
-    detectors = {r: Detector(rig.radars[r], settings.cfar) for r in RADARS}
-    ordered = Detector(rig.radars["horizontal"], replace(settings.cfar, kind="os"))
+    detectors = {r: Detector(rig.radars[r], cfar) for r in RADARS}
+    ordered = Detector(rig.radars["horizontal"], replace(cfar, kind="os"))
     associator = Associator(rig)
     heatmaps = {r: _kept(imagers[r].process(frames[r])) for r in RADARS}
     found = {r: detectors[r].process(heatmaps[r]) for r in RADARS}
-    first = int(np.searchsorted(heatmaps["horizontal"].range_m, settings.cfar.min_range_m))
+    first = int(np.searchsorted(heatmaps["horizontal"].range_m, cfar.min_range_m))
 
     def whole() -> object:
         both = {r: detectors[r].process(imagers[r].process(frames[r])) for r in RADARS}
         return associator.process(both["horizontal"], both["vertical"], None)
 
     def whole_peer() -> object:
-        return [ca_peaks(peers[r].process(frames[r]), first, settings.cfar) for r in RADARS]
+        return [ca_peaks(peers[r].process(frames[r]), first, cfar) for r in RADARS]
 
-    frame, heatmap, one = frames["horizontal"], heatmaps["horizontal"], "horizontal"
+    one: RadarId = "horizontal"
+    frame, heatmap = frames[one], heatmaps[one]
     return {
         "heatmap, one radar": lambda: imagers[one].process(frame),
         f"heatmap, one radar ({PEER})": lambda: peers[one].process(frame),
         "CFAR CA, one radar": lambda: detectors[one].process(heatmap),
-        f"CFAR CA, one radar ({PEER})": lambda: ca_peaks(heatmap.power, first, settings.cfar),
+        f"CFAR CA, one radar ({PEER})": lambda: ca_peaks(heatmap.power, first, cfar),
         "CFAR OS, one radar": lambda: ordered.process(heatmap),
         "association": lambda: associator.process(found["horizontal"], found["vertical"], None),
         "two-radar frame to 3-D points": whole,

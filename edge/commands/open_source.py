@@ -8,10 +8,9 @@ from pathlib import Path
 
 from edge.errors import CaptureError, ConfigError
 from edge.frames import RADARS, RadarId
+from edge.recording.importing import open_captures
 from edge.rig import Rig, load_rig
-from edge.sources import loop_sum
 from edge.sources.base import FrameSource
-from edge.sources.ti_capture import CaptureFolder
 
 
 def add_rig_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +40,7 @@ def calibrated(rig: Rig, calibrations: list[str]) -> Rig:
         calibrations: ``FILE`` for the only radar of a rig, or ``RADAR=FILE``.
     """
     for text in calibrations:
-        radar, path = _split(text, rig)
+        radar, path = named_path(text, rig)
         rig = rig.with_calibration(radar, path)
     return rig
 
@@ -60,22 +59,22 @@ def open_capture(path: Path, rig: Rig) -> tuple[FrameSource, list[str]]:
     if len(rig.radars) != 1:
         raise CaptureError(
             f"{path} is a folder of one radar's files but rig {rig.name} has {len(rig.radars)}",
-            action="join the captures with: rfconstruct import FOLDER FOLDER --rig NAME --out FILE.mcap",
+            action="join the captures with: rfconstruct import RADAR=FOLDER RADAR=FOLDER --rig NAME --out FILE.mcap",
         )
-    radar = next(iter(rig.radars))
-    if (path / loop_sum.FILE_NAME).is_file():
-        return loop_sum.LoopSum(path, rig, radar), [loop_sum.NOTE]
-    capture = CaptureFolder(path, rig, radar)
-    return capture, capture.notes
+    source = next(iter(open_captures(path, rig).values()))
+    return source, list(getattr(source, "notes", []))
 
 
-def _split(text: str, rig: Rig) -> tuple[RadarId, Path]:
+def named_path(text: str, rig: Rig) -> tuple[RadarId, Path]:
+    """``RADAR=PATH``, or ``PATH`` alone for the only radar of a rig.
+
+    Raises:
+        ConfigError: the radar is not named and the rig has two.
+    """
     head, sign, tail = text.partition("=")
     for radar in RADARS:
         if sign and head == radar:
             return radar, Path(tail)
     if len(rig.radars) == 1:
         return next(iter(rig.radars)), Path(text)
-    raise ConfigError(
-        "calibration of which radar?", value=text, allowed=" or ".join(f"{radar}=FILE" for radar in rig.radars)
-    )
+    raise ConfigError("file of which radar?", value=text, allowed=" or ".join(f"{radar}=PATH" for radar in rig.radars))

@@ -53,8 +53,8 @@ def cloud_picture(path: Path, cloud: FusedCloud, horizontal: Float32, vertical: 
     )
     limits = _limits([layer.xyz_m for layer in layers])
     spans = [high - low for low, high in limits]
-    height_in = 1.0 + 3.0 * (0.9 + 4.0 * max(spans[0], spans[2]) / (2.0 * spans[1] + spans[0]))
-    figure = new_figure(13.0, min(height_in, 14.0), "Fused window of travel, three sides", subtitle)
+    row_in = 1.0 + 10.5 * max(spans[0], spans[2]) / (2.0 * spans[1] + spans[0])
+    figure = new_figure(13.0, min(0.9 + 3.0 * row_in, 14.0), "Fused window of travel, three sides", subtitle)
     rows = figure.subfigures(len(layers), 1)
     for row, layer in zip(rows, layers, strict=True):
         row.suptitle(layer.title, x=0.01, ha="left", fontsize=10, color=layer.colour, fontweight="bold")

@@ -26,10 +26,11 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str = ""
     """
     try:
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
     except ImportError as error:
         raise DependencyError("pictures need matplotlib", action="pip install 'rfconstruct[plot]'") from error
-    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
-    figure.get_layout_engine().set(rect=(0.0, 0.0, 1.0, 1.0 - HEAD_IN / height_in))
+    below_head = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, 1.0 - HEAD_IN / height_in))
+    figure = Figure(figsize=(width_in, height_in), layout=below_head, facecolor="white")
     figure.text(0.01, 1.0 - 0.24 / height_in, title, ha="left", va="center", fontsize=13, color=INK, fontweight="bold")
     figure.text(0.01, 1.0 - 0.48 / height_in, subtitle, ha="left", va="center", fontsize=9, color=MUTED)
     return figure

@@ -16,6 +16,8 @@ DYNAMIC_RANGE_DB = 50.0
 SHOWN_COSINE = np.sin(np.radians(70.0))
 FIELD_OF_VIEW_COSINE = np.sin(np.radians(45.0))
 NEAREST_LIMIT_M, FARTHEST_LIMIT_M = 5.0, 15.0
+VERTICAL_SHARE = 0.75
+"""Heights up to this share of the range are drawn: somewhat more than the field of view."""
 
 
 def heatmap_picture(
@@ -33,8 +35,8 @@ def heatmap_picture(
     """
     number = next(iter(heatmaps.values())).number
     limit_m = _limit_m(detections)
-    width = 7.4 if len(heatmaps) == 1 else 12.6
-    figure = new_figure(width, 6.2, f"Range-angle heatmaps and CFAR detections, frame {number}", subtitle)
+    size_in = (7.4, 5.8) if len(heatmaps) == 1 else (12.6, 6.6)
+    figure = new_figure(*size_in, f"Range-angle heatmaps and CFAR detections, frame {number}", subtitle)
     for axes, (radar, heatmap) in zip(_row(figure, len(heatmaps)), heatmaps.items(), strict=True):
         _panel(figure, axes, heatmap, detections[radar], limit_m)
     return write(figure, path)
@@ -48,7 +50,7 @@ def _limit_m(detections: Mapping[RadarId, Detections]) -> float:
 
 
 def _row(figure: Any, count: int) -> list[Any]:
-    ratios = [1.5, 1.0][:count]
+    ratios = [1.88, 1.0][:count]
     return list(np.atleast_1d(figure.subplots(1, count, width_ratios=ratios)).ravel())
 
 
@@ -76,12 +78,14 @@ def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m:
         axes.plot(*ray, color="white", linewidth=0.7, linestyle=":", alpha=0.7)
     name = "Horizontal radar, from above" if from_above else "Vertical radar, from the side"
     labels = ("left  y (m)", "forward  x (m)") if from_above else ("forward  x (m)", "up  z (m)")
-    dress(axes, f"{name}: {int(shown.sum())} of {len(found)} detections", *labels)
+    dress(axes, f"{name}\n{int(shown.sum())} of {len(found)} detections in the picture", *labels)
     axes.grid(False)
     axes.set_aspect("equal")
     if from_above:
         axes.invert_xaxis()
-    bar = figure.colorbar(mesh, ax=axes, shrink=0.7, pad=0.01, location="bottom" if from_above else "right")
+    else:
+        axes.set_ylim(-VERTICAL_SHARE * limit_m, VERTICAL_SHARE * limit_m)
+    bar = figure.colorbar(mesh, ax=axes, shrink=0.7, pad=0.02, location="bottom")
     bar.set_label("power (dB over 1 LSB²)", fontsize=9, color=MUTED)
     bar.ax.tick_params(labelsize=8, colors=INK)
 
@@ -93,10 +97,10 @@ def _cartesian(heatmap: Heatmap, max_range_m: float) -> tuple[Float32, Float32, 
     power_db = 10.0 * np.log10(np.maximum(heatmap.power[angle, :last], 1e-6))
     u = np.clip(_edges(heatmap.direction_cosine[angle]), -1.0, 1.0)[:, None]
     r = np.maximum(_edges(heatmap.range_m[:last]), 0.0)[None, :]
-    return power_db, r * u, r * np.sqrt(1.0 - u**2)
+    return power_db.astype(np.float32), r * u, (r * np.sqrt(1.0 - u**2)).astype(np.float32)
 
 
 def _edges(centres: Float32) -> Float32:
     """Borders between equally spaced cells."""
     half = 0.5 * (centres[1] - centres[0])
-    return np.append(centres - half, centres[-1] + half)
+    return np.append(centres - half, centres[-1] + half).astype(np.float32)

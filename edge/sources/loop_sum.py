@@ -61,6 +61,12 @@ class LoopSum:
                 action="give the rig it was captured with (--rig)",
             )
         self._frame = RadarFrame(radar, 0, 0, split_loop_sum(total, loops), layout)
+        self.notes = [NOTE]
+
+    @staticmethod
+    def is_at(path: Path) -> bool:
+        """Whether a folder holds a sum over loops."""
+        return (path / FILE_NAME).is_file()
 
     @property
     def total_frames(self) -> int:

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rfconstruct listen``: prints what a running pipeline publishes, one line a message."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from edge.errors import ExitCode
+from edge.stream.client import DEFAULT_ENDPOINT, Client, connect
+from edge.stream.convert import save_shape
+from edge.stream.messages import (
+    CloudMessage,
+    DetectionsMessage,
+    HeartbeatMessage,
+    HeatmapMessage,
+    Message,
+    PoseMessage,
+    ShapeMessage,
+    StatusMessage,
+)
+
+DEFAULT_TOPICS = ("shape", "cloud", "status")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="address of the publisher (%(default)s)")
+    parser.add_argument(
+        "--topic", action="append", help="shape, cloud, det, pose, heat, status, hb (default: shape, cloud, status)"
+    )
+    parser.add_argument("--save", type=Path, metavar="DIR", help="write every shape as PLY")
+    parser.add_argument("--count", type=int, help="end after so many messages")
+    parser.add_argument("--timeout", type=float, metavar="SECONDS", help="end after so long a silence")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print until interrupted, until ``--count`` or until the silence of ``--timeout``; exit code 3 when that came."""
+    if args.save is not None:
+        args.save.mkdir(parents=True, exist_ok=True)
+    with connect(args.endpoint, args.topic or DEFAULT_TOPICS, args.timeout) as client:
+        try:
+            seen = _print_messages(client, args)
+        finally:
+            _print_account(client)
+    return ExitCode.OK if args.count is None or seen >= args.count else ExitCode.DEGRADED
+
+
+def _print_messages(client: Client, args: argparse.Namespace) -> int:
+    seen = 0
+    for message in client:
+        content = describe(message)
+        if args.json:
+            print(json.dumps(content), flush=True)
+        else:
+            kind = content.pop("type")
+            print(f"{kind:<11}" + "  ".join(f"{key} {value}" for key, value in content.items()), flush=True)
+        if args.save is not None and isinstance(message, ShapeMessage):
+            save_shape(args.save / f"shape_{message.identity}_{message.header.sequence}.ply", message)
+        seen += 1
+        if args.count is not None and seen >= args.count:
+            break
+    return seen
+
+
+def _print_account(client: Client) -> None:
+    """What was lost on the way, on stderr."""
+    lost = sum(client.lost.values())
+    if lost or client.malformed:
+        print(f"lost {client.lost}, malformed {client.malformed}", file=sys.stderr)
+
+
+def describe(message: Message) -> dict[str, Any]:
+    """The message's main facts as plain values."""
+    kind = type(message).__name__.removesuffix("Message").lower()
+    head: dict[str, Any] = {"type": kind, "src": message.header.source}
+    match message:
+        case ShapeMessage():
+            position = [round(float(x), 2) for x in message.pose.position_m]
+            facts = {"id": message.identity, "class": message.class_name, "confidence": round(message.confidence, 2)}
+            sizes = {"size_m": [round(float(x), 2) for x in message.size_m], "at_m": position}
+            return {**head, **facts, **sizes, "points": len(message.fine_m), "from": message.input_points}
+        case CloudMessage():
+            return {**head, "points": len(message.cloud), "frames": message.cloud.frames,
+                    "travel_m": round(message.cloud.travel_m, 2)}  # fmt: skip
+        case DetectionsMessage():
+            counts = {r: len(d) for r, d in (("h", message.horizontal), ("v", message.vertical)) if d is not None}
+            return {**head, "frame": message.number, **counts, "points": len(message.points or ())}
+        case HeatmapMessage():
+            return {**head, "radar": message.radar, "frame": message.number, "peak_db": float(message.power_db.max())}
+        case PoseMessage():
+            return {**head, "t_ns": message.pose.t_ns, "at_m": [round(float(x), 3) for x in message.pose.position_m]}
+        case StatusMessage():
+            radars = {name: f"{r.frames_ok}/{r.frames_in}" for name, r in message.status.radars.items()}
+            codes = [reason.code for reason in message.status.reasons]
+            return {**head, "state": message.status.state, **radars, "reasons": codes}
+        case HeartbeatMessage():
+            return {**head, "state": message.state}
