@@ -18,9 +18,10 @@ from edge.recording.writer import RecordingWriter
 from edge.rig import Rig
 from edge.sources.base import Loss
 from edge.sources.dca1000_file import Dca1000File
+from edge.sources.loop_sum import LoopSum
 from edge.sources.ti_capture import CaptureFolder
 
-CaptureFile = CaptureFolder | Dca1000File
+CaptureFile = CaptureFolder | Dca1000File | LoopSum
 TRAJECTORY_SUFFIXES = (".tum", ".txt")
 
 
@@ -142,6 +143,8 @@ def import_poses(path: Path) -> list[Pose]:
 
 
 def _open(path: Path, rig: Rig, radar: RadarId, t_start_ns: int | None) -> CaptureFile:
+    if LoopSum.is_at(path):
+        return LoopSum(path, rig, radar)
     if rig.radars[radar].schedule.layout.kind == "cascade":
         return CaptureFolder(path, rig, radar, t_start_ns)
     paths = sorted(path.glob("*.bin"), key=_card_order) if path.is_dir() else [path]

@@ -30,10 +30,11 @@ CHUNK = struct.Struct("<QQQII")
 MESSAGE = struct.Struct("<HIQQ")
 FOOTER = struct.Struct("<QQI")
 FOOTER_BYTES = RECORD.size + FOOTER.size + len(MAGIC)
+DATA_END_BYTES = 4
 LARGEST_CHUNK = 256 << 20
 LARGEST_SUMMARY = 256 << 20
 LARGEST_ATTACHMENT = 64 << 20
-_READ_ERRORS = (struct.error, EndOfFile, UnicodeDecodeError, ValueError, KeyError)
+_READ_ERRORS = (struct.error, EndOfFile, ValueError, KeyError, OverflowError)
 
 
 @dataclass(slots=True)
@@ -45,12 +46,14 @@ class ReadReport:
         unverified: of these, from a cut chunk, whose CRC cannot be checked.
         damaged_chunks: chunks left out: their CRC or their structure is wrong.
         bytes_lost: bytes of damaged chunks and of the cut end.
+        missing: messages that the summary counts and the file does not give; 0 in a file without its end.
     """
 
     messages: int = 0
     unverified: int = 0
     damaged_chunks: int = 0
     bytes_lost: int = 0
+    missing: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +125,8 @@ class McapFile:
         """
         channels = dict(self._channels)
         for record in self._records():
-            if record.opcode == Opcode.DATA_END and record.whole:
-                return
+            if record.opcode == Opcode.DATA_END and record.length == DATA_END_BYTES:
+                break
             if record.opcode == Opcode.CHUNK:
                 yield from self._chunk_messages(record, channels, report)
             elif not record.whole:
@@ -131,6 +134,8 @@ class McapFile:
             elif record.opcode in (Opcode.CHANNEL, Opcode.MESSAGE) and record.length <= LARGEST_CHUNK:
                 head = RECORD.pack(record.opcode, record.length)
                 yield from self._inner(memoryview(head + self._read(record.offset, record.length)), channels, report)
+        if self.statistics is not None and self._fd >= 0:
+            report.missing = max(0, self.statistics.message_count - report.messages)
 
     def close(self) -> None:
         """Close the file; any iteration ends."""
@@ -201,7 +206,7 @@ class McapFile:
             if opcode == Opcode.CHANNEL:
                 channel = _parse(Channel, data[body : body + length])
                 if channel is not None:
-                    channels[channel.id] = channel.topic
+                    channels.setdefault(channel.id, channel.topic)  # what the summary says has a CRC
             elif opcode == Opcode.MESSAGE and length >= MESSAGE.size:
                 channel_id, _, log_time_ns, _ = MESSAGE.unpack_from(data, body)
                 if channel_id in channels:
@@ -226,8 +231,9 @@ class McapFile:
                     self.metadata[metadata.name] = metadata.metadata
             elif record.opcode == Opcode.ATTACHMENT:
                 body = self._read(record.offset, record.length)
-                attachment = _parse(Attachment, body)
-                if attachment is not None and zlib.crc32(body[:-4]).to_bytes(4, "little") == body[-4:]:
+                crc_holds = zlib.crc32(body[:-4]).to_bytes(4, "little") == body[-4:]
+                attachment = _parse(Attachment, body) if crc_holds else None
+                if attachment is not None:
                     self.attachments[attachment.name] = attachment.data
 
     def _read_summary(self) -> None:

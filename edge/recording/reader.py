@@ -110,6 +110,7 @@ class RecordingReader:
             "bytes_lost": self.report.bytes_lost,
             "damaged_chunks": self.report.damaged_chunks,
             "unverified": self.report.unverified,
+            "missing": self.report.missing,
             "t_start_ns": span_ns[0],
             "t_end_ns": span_ns[1],
             "duration_s": (span_ns[1] - span_ns[0]) / 1e9,
@@ -124,17 +125,17 @@ class RecordingReader:
             ConfigError, CalibrationError: this version of the software refuses the rig.
         """
         texts = {n: data for n, data in self._mcap.attachments.items() if n.startswith(schema.RIG_PREFIX)}
-        name = Path(self.rig_name).name
-        if schema.RIG_PREFIX + FILE_NAME not in texts or not name:
+        if schema.RIG_PREFIX + FILE_NAME not in texts or not _is_file_name(self.rig_name):
             raise RecordingError(
                 f"{self.path}: holds no rig", action="give one: rfconstruct replay --rig NAME", value=sorted(texts)
             )
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="rfconstruct-rig-")
-        folder = Path(self._folder.name) / name
+        folder = Path(self._folder.name) / self.rig_name
         folder.mkdir(exist_ok=True)
         for stored, data in texts.items():
-            (folder / Path(stored).name).write_bytes(data)
+            if _is_file_name(stored.removeprefix(schema.RIG_PREFIX)):
+                (folder / stored.removeprefix(schema.RIG_PREFIX)).write_bytes(data)
         toml = folder / FILE_NAME
         toml.write_text(_CALIBRATION_KEY.sub("", toml.read_text(encoding="utf-8", errors="replace")), encoding="utf-8")
         rig = load_rig(folder)
@@ -188,3 +189,8 @@ class RecordingReader:
             last = max(last, message.log_time_ns)
         self._counts, self._span_ns = dict(counts), (first or 0, last)
         return self._counts, self._span_ns
+
+
+def _is_file_name(name: str) -> bool:
+    """True for one that stays in its folder."""
+    return bool(re.fullmatch(r"[\w .+-]{1,60}", name)) and name not in (".", "..")

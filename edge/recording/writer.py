@@ -135,7 +135,7 @@ class RecordingWriter:
         description = (schema.__doc__ or "").encode()
         frame_schema = writer.add_schema(schema.FRAME_SCHEMA, "x-text", description)
         pose_schema = writer.add_schema(schema.POSE_SCHEMA, "jsonschema", schema.POSE_JSON_SCHEMA)
-        result_schema = writer.add_schema(schema.RESULT_SCHEMA, "x-text", description)
+        result_schema = writer.add_schema(schema.RESULT_SCHEMA, "", b"")
         frames: dict[RadarId, int] = {
             radar: writer.add_channel(schema.FRAME_TOPICS[radar], schema.FRAME_ENCODING, frame_schema)
             for radar in self._layouts

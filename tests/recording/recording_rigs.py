@@ -17,7 +17,7 @@ from edge.recording.schema import RecordedMessage
 from edge.recording.writer import RecordingWriter
 
 LAYOUT = Layout("dca1000", 1, 1, 2, 4, 2, "QI")
-BIG = Layout("cascade", 4, 2, 3, 128, 4)
+BIG = Layout("cascade", 4, 2, 3, 256, 4)
 """Large enough that a frame is a chunk of its own."""
 
 Item = RadarFrame | Pose | RecordedMessage
@@ -52,7 +52,7 @@ def content(count: int, layout: Layout = LAYOUT) -> list[Item]:
     for n in range(count):
         t_ns = 10**9 + 20_000_000 * n + 15_000_000
         items += [frame("horizontal", n, layout), pose(n), frame("vertical", n, layout)]
-        items.append(RecordedMessage("/shape", t_ns, bytes([n % 256]) * (n % 7)))
+        items.append(RecordedMessage("/shape", t_ns, b"result %06d" % n))
     return items
 
 

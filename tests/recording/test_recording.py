@@ -230,3 +230,24 @@ def test_other_frames_under_a_topic_are_refused(tmp_path: Path) -> None:
         writer.finish()
         with RecordingReader(path) as reader, pytest.raises(RecordingError, match=message):
             list(reader)
+
+
+@pytest.mark.parametrize("name", ["../outside", "..", "a/b", "nul\0", "x" * 300])
+def test_names_in_a_recording_never_leave_its_folder(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.mcap"
+    writer = Writer(str(path), compression=CompressionType.NONE)
+    writer.start("rfconstruct", "test")
+    writer.add_metadata("rfconstruct", {"rig": "car"})
+    text = (load_rig("awr1843_pair").directory / "rig.toml").read_bytes()
+    writer.add_attachment(0, 0, "rig/rig.toml", "", text)
+    writer.add_attachment(0, 0, f"rig/{name}", "", b"hostile")
+    writer.finish()
+    with RecordingReader(path) as reader:
+        assert [p.name for p in reader.read_rig().directory.iterdir()] == ["rig.toml"]
+    writer = Writer(str(path), compression=CompressionType.NONE)
+    writer.start("rfconstruct", "test")
+    writer.add_metadata("rfconstruct", {"rig": name})
+    writer.add_attachment(0, 0, "rig/rig.toml", "", text)
+    writer.finish()
+    with RecordingReader(path) as reader, pytest.raises(RecordingError, match="holds no rig"):
+        reader.read_rig()
