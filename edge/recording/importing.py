@@ -101,19 +101,13 @@ def import_capture(
         if isinstance(source, CaptureFolder):
             report.notes += [f"{radar}: {note}" for note in source.notes]
             report.notes += [f"{radar}: {name} is dead" for name in source.dead_channels()]
-    total, done, expected = sum(source.total_frames for source in sources.values()), 0, dict.fromkeys(sources, 0)
-    with RecordingWriter(out_path, rig) as writer:
-        for item in heapq.merge(*sources.values(), poses, key=_instant):
-            if isinstance(item, Pose):
-                writer.pose(item)
-                report.poses += 1
-                continue
-            _count(report, item, expected)
-            if isinstance(item, RadarFrame):
-                writer.frame(item)
-            done += 1
-            if progress is not None:
-                progress(done, total)
+    writer = RecordingWriter(out_path, rig)
+    try:
+        with writer:
+            _copy(sources, poses, writer, report, progress)
+    except BaseException:
+        out_path.unlink(missing_ok=True)  # half an import would pass for a whole one
+        raise
     return report
 
 
@@ -140,6 +134,28 @@ def import_poses(path: Path) -> list[Pose]:
             raise PoseError(f"{path}, line {number}: time does not advance", value=pose.t_ns, allowed="ascending")
         poses.append(pose)
     return poses
+
+
+def _copy(
+    sources: Mapping[RadarId, CaptureFile],
+    poses: Iterable[Pose],
+    writer: RecordingWriter,
+    report: ImportReport,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    """Merge all sources by time into the recording, counting."""
+    total, done, expected = sum(source.total_frames for source in sources.values()), 0, dict.fromkeys(sources, 0)
+    for item in heapq.merge(*sources.values(), poses, key=_instant):
+        if isinstance(item, Pose):
+            writer.pose(item)
+            report.poses += 1
+            continue
+        _count(report, item, expected)
+        if isinstance(item, RadarFrame):
+            writer.frame(item)
+        done += 1
+        if progress is not None:
+            progress(done, total)
 
 
 def _open(path: Path, rig: Rig, radar: RadarId, t_start_ns: int | None) -> CaptureFile:
