@@ -243,7 +243,7 @@ class StreamSettings:
     """
 
     endpoints: tuple[str, ...] = ("tcp://127.0.0.1:5600",)
-    send_high_water_mark: int = 16
+    send_high_water_mark: int = 32
     shape_encoding: PointEncoding = "f4"
 
     def __post_init__(self) -> None:

@@ -143,6 +143,8 @@ def read_manifest(directory: Path) -> Manifest:
         golden_file=golden["file"],
         tolerance_m=golden["tolerance_m"],
     )
+    if len(manifest.files) != len(entries):
+        raise _refused(path, "files.file", [entry["file"] for entry in entries], "different names")
     _check(path, manifest)
     return manifest
 
@@ -216,6 +218,12 @@ def _check(path: Path, manifest: Manifest) -> None:
         ),
         (manifest.default_file in manifest.files, "default_file", manifest.default_file, ", ".join(manifest.files)),
         (all(isinstance(t, str) and t for t in texts), "classes and rigs", texts, "names"),
+        (
+            all(re.fullmatch(r"[a-z0-9_-]{1,32}", str(name)) for name in manifest.classes),
+            "classes",
+            manifest.classes,
+            "lower-case names that can stand in a topic",
+        ),
         (
             len(set(map(str, manifest.classes))) == len(manifest.classes) > 0,
             "classes",

@@ -26,7 +26,8 @@ STAGE = "nn"
 FULL_WINDOW_FRAMES = 60
 """Frames of a window from which on its confidence is not lowered (one second at 60 frames/s)."""
 ENOUGH_POINTS = 256
-"""Input points from which on the confidence is not lowered."""
+"""Input points from which on the confidence is not lowered: 60 held-out clouds thinned to 64, 128, 256 and 768 points
+were completed to a mean Chamfer distance of 18.5, 16.0, 13.8 and 13.9 cm."""
 CUT_WINDOW_FACTOR = 0.8
 """Confidence of a window that time, a pose gap or the end of the data cut, against a whole one."""
 PROBABILITY_TOLERANCE = 0.02

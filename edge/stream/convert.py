@@ -82,6 +82,8 @@ def encode_cloud(cloud: FusedCloud) -> Draft:
         "n_frames": cloud.frames,
         "pts": block,
     }
+    if np.isfinite(cloud.sensor_m).all():
+        fields["sensor"] = cloud.sensor_m.tolist()
     flags = _window_flags(cloud.frames, cloud.complete)
     return Draft(f"{MAJOR}/cloud/", "cloud", cloud.t_end_ns, "window", flags, fields, [payload])
 

@@ -142,6 +142,7 @@ def _cloud(header: Header, received: Received) -> CloudMessage:
         travel_m=fields.number("travel_m"),
         frames=fields.integer("n_frames"),
         complete=not header.flags & FLAG_CUT_WINDOW,
+        sensor_m=np.array(fields.numbers("sensor", 3) if "sensor" in fields else [np.nan] * 3),
     )
     return CloudMessage(header, cloud)
 

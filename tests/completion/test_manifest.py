@@ -52,6 +52,8 @@ def test_shipped_manifest_is_read() -> None:
         (lambda c: c.update(schema=2), "schema"),
         (lambda c: c.update(classes="car"), "key classes"),
         (lambda c: c.update(classes=["car", "car"]), "classes"),
+        (lambda c: c.update(classes=["Car/1"]), "classes"),
+        (lambda c: c["files"].append(c["files"][0]), "files.file"),
         (lambda c: c.update(rigs=[{}]), "classes and rigs"),
         (lambda c: c["input"].update(min_points=True), "key input.min_points"),
         (lambda c: c["input"].update(min_points=4096), "input and output"),

@@ -287,7 +287,7 @@ def test_status_is_sent_at_once_when_it_changes() -> None:
 
 
 def test_several_threads_may_publish() -> None:
-    with publisher() as sender, subscribed(sender, "pose") as client:
+    with publisher(replace(LOCAL, send_high_water_mark=100)) as sender, subscribed(sender, "pose") as client:
         threads = [threading.Thread(target=lambda: [sender.pose(pose()) for _ in range(4)]) for _ in range(4)]
         for thread in threads:
             thread.start()
