@@ -278,6 +278,7 @@ class FusedCloud:
         travel_m: path length covered inside the window.
         frames: frames in the window, those without points included.
         complete: True when the window covers the configured travel; False when time, a pose gap or the end cut it.
+        sensor_m: float64 [3], mean position of the rig over the window's frames, window frame; NaN: not known.
     """
 
     xyz_m: Float32
@@ -289,6 +290,7 @@ class FusedCloud:
     travel_m: float
     frames: int
     complete: bool
+    sensor_m: Float64
 
     def __len__(self) -> int:
         return len(self.xyz_m)
@@ -307,6 +309,7 @@ class ObjectCloud:
         travel_m: travel inside the window.
         frames: frames of the window.
         complete: as in FusedCloud.
+        sensor_m: float64 [3], mean position of the rig over the window's frames, object frame; NaN: not known.
     """
 
     identity: int
@@ -318,6 +321,7 @@ class ObjectCloud:
     travel_m: float
     frames: int
     complete: bool
+    sensor_m: Float64
 
     def __len__(self) -> int:
         return len(self.xyz_m)

@@ -140,15 +140,17 @@ class ObjectTracker:
     ) -> ObjectCloud:
         """One object in its own frame."""
         origin_m = np.array([center_m[0], center_m[1], 0.0])
-        under_rig_m = cloud.reference.position_m - np.array([0.0, 0.0, self._height_m])
+        rig_m = np.array([0.0, 0.0, self._height_m])
+        sensor_m = rotation_matrix(cloud.reference.quaternion_xyzw) @ cloud.sensor_m + rig_m
         return ObjectCloud(
             identity=identity,
             xyz_m=(xyz_m[member] - origin_m).astype(np.float32),
             power_db=cloud.power_db[member],
-            pose=Pose(cloud.t_end_ns, under_rig_m + origin_m, _UPRIGHT.copy()),
+            pose=Pose(cloud.t_end_ns, cloud.reference.position_m - rig_m + origin_m, _UPRIGHT.copy()),
             t_start_ns=cloud.t_start_ns,
             t_end_ns=cloud.t_end_ns,
             travel_m=cloud.travel_m,
             frames=cloud.frames,
             complete=cloud.complete,
+            sensor_m=sensor_m - origin_m,
         )

@@ -205,6 +205,11 @@ class TemporalFusion:
         position, quaternion = self._pose[slot, :3].copy(), self._pose[slot, 3:].copy()
         return Pose(int(self._t_ns[slot]), position, quaternion), rotation_matrix(quaternion)
 
+    def _mean_position_m(self) -> Float64:
+        """Mean position of the rig over the window's frames, in the odometry frame."""
+        mean: Float64 = self._pose[np.arange(self._start, self._frames) % MAX_FRAMES, :3].mean(axis=0)
+        return mean
+
     def _close(self, end: WindowEnd) -> FusedCloud | None:
         """Everything since the window's first frame, seen from its pose; None when it has no frame."""
         frames = self._frames - self._start
@@ -223,4 +228,5 @@ class TemporalFusion:
         return FusedCloud(
             *(xyz, power, number, reference, reference.t_ns, t_end_ns, self._travel_m(), frames),
             complete=end is WindowEnd.TRAVEL and frames >= self.settings.min_frames and whole,
+            sensor_m=(self._mean_position_m() - reference.position_m) @ rotation,
         )

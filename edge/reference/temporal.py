@@ -17,13 +17,15 @@ TOLERANCE_M = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Frames ``first`` to ``last`` (both included) and their points in the frame of the first pose, float64 [n, 3]."""
+    """Frames ``first`` to ``last`` (both included); their points [n, 3] and the rig's mean position [3] seen from the first
+    pose, float64."""
 
     first: int
     last: int
     travel_m: float
     complete: bool
     xyz_m: Float64
+    sensor_m: Float64
 
 
 def matrix(pose: Pose) -> Float64:
@@ -79,7 +81,8 @@ def fuse(clouds: Sequence[PointCloud], poses: Sequence[Pose], settings: FusionSe
             points = np.column_stack([clouds[k].xyz_m.astype(np.float64), np.ones(len(clouds[k]))])
             moved.append((points @ (back @ to_odom[k]).T)[:, :3])
         complete = covered and last - first + 1 >= settings.min_frames
-        return Window(first, last, max(path_m[last] - path_m[first], 0.0), complete, np.concatenate(moved))
+        sensor_m = np.mean([(back @ to_odom[k])[:3, 3] for k in range(first, last + 1)], axis=0)
+        return Window(first, last, max(path_m[last] - path_m[first], 0.0), complete, np.concatenate(moved), sensor_m)
 
     def after(first: int, now: int, stored: int) -> int:
         for k in range(first + 1, stored):

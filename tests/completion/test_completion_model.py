@@ -16,17 +16,18 @@ import pytest
 from edge.completion.model import CompletionModel, confidence
 from edge.config import CompletionSettings
 from edge.errors import ConfigError, ModelError
-from edge.frames import Float32, ObjectCloud, Pose
+from edge.frames import Float32, Float64, ObjectCloud, Pose
 from edge.resources import shipped_dir
 
 SHIPPED = shipped_dir("models") / "default"
 SETTINGS = CompletionSettings()
+SENSOR_M = np.array([-8.0, 0.0, 0.8])
 
 
-def cloud(points: Float32, frames: int = 60, complete: bool = True) -> ObjectCloud:
-    """An object cloud of these points."""
+def cloud(points: Float32, frames: int = 60, complete: bool = True, sensor_m: Float64 = SENSOR_M) -> ObjectCloud:
+    """An object cloud of these points, seen along x."""
     pose = Pose(9, np.array([1.0, 2.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    return ObjectCloud(7, points, np.zeros(len(points), np.float32), pose, 5, 9, 3.0, frames, complete)
+    return ObjectCloud(7, points, np.zeros(len(points), np.float32), pose, 5, 9, 3.0, frames, complete, sensor_m)
 
 
 @pytest.fixture(scope="module")

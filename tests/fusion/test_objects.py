@@ -19,6 +19,8 @@ from edge.reference import clustering
 
 S = 1_000_000_000
 HEIGHT_M = 0.8
+SENSOR_M = np.array([1.5, 0.25, HEIGHT_M])
+"""Mean position of the rig over the windows, odometry frame."""
 CAR_M, PERSON_M = (4.0, 1.8, 1.5), (0.5, 0.5, 1.7)
 
 
@@ -48,6 +50,7 @@ def cloud(odom_m: Float64, t_end_s: float = 2.0, reference: Pose | None = None) 
         travel_m=3.0,
         frames=60,
         complete=True,
+        sensor_m=transform_points(inverse(pose), SENSOR_M[None])[0],
     )
 
 
@@ -57,6 +60,10 @@ def tracker(**changes: float) -> ObjectTracker:
 
 def in_odom(found: ObjectCloud) -> Float64:
     return transform_points(found.pose, found.xyz_m)
+
+
+def sensor_in_odom(found: ObjectCloud) -> Float64:
+    return transform_points(found.pose, found.sensor_m[None])[0]
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -115,6 +122,7 @@ def test_a_car_and_a_pedestrian_stand_in_their_own_frames() -> None:
         np.testing.assert_array_equal(found.pose.quaternion_xyzw, [0, 0, 0, 1])
         assert found.pose.t_ns == found.t_end_ns == 2 * S
         np.testing.assert_allclose(in_odom(found), truth, atol=1e-5)
+        np.testing.assert_allclose(sensor_in_odom(found), SENSOR_M, atol=1e-9)
         np.testing.assert_allclose(found.xyz_m.max(axis=0), [size_m[0] / 2, size_m[1] / 2, size_m[2]], atol=1e-5)
         assert found.xyz_m.dtype == np.float32
     np.testing.assert_array_equal(far.power_db, np.arange(len(car)))
@@ -128,6 +136,7 @@ def test_tilt_of_the_rig_does_not_tilt_the_ground() -> None:
     car = box(10.0, 4.0, CAR_M)
     (found,) = tracker().process(cloud(car, reference=Pose(S, np.array([0.0, 0.0, HEIGHT_M]), roll)))
     np.testing.assert_allclose(in_odom(found), car, atol=1e-5)
+    np.testing.assert_allclose(sensor_in_odom(found), SENSOR_M, atol=1e-9)
     assert found.xyz_m[:, 2].min() == pytest.approx(0.2, abs=1e-5)
 
 

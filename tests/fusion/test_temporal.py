@@ -73,6 +73,7 @@ def test_three_metres_at_half_a_metre_a_second_are_360_steps() -> None:
     np.testing.assert_array_equal(window.frame_number, np.arange(361))
     np.testing.assert_array_equal(window.reference.position_m, [0, 0, 0])
     np.testing.assert_allclose(window.xyz_m[:, 0], 5.0 + 0.5 * np.arange(361) * FRAME_NS / 1e9, atol=1e-6)
+    np.testing.assert_allclose(window.sensor_m, [1.5, 0, 0], atol=1e-6)
     assert fusion.windows == {WindowEnd.TRAVEL: 1}
 
 
@@ -292,3 +293,4 @@ def assert_equal(windows: Sequence[FusedCloud], expected: Sequence[Any], poses: 
         assert window.travel_m == pytest.approx(truth.travel_m, abs=1e-9)
         assert window.reference.t_ns == poses[truth.first].t_ns
         np.testing.assert_allclose(window.xyz_m, truth.xyz_m, atol=1e-5)
+        np.testing.assert_allclose(window.sensor_m, truth.sensor_m, atol=1e-6)

@@ -20,7 +20,7 @@ def pose(t_ns: int = 1_000_000_000) -> Pose:
 def object_cloud(points: int = 1) -> ObjectCloud:
     xyz = np.arange(3 * points, dtype=np.float32).reshape(points, 3) / 4
     power = np.zeros(points, np.float32)
-    return ObjectCloud(5, xyz, power, pose(), 400_000_000, 1_000_000_000, 3.0, 36, True)
+    return ObjectCloud(5, xyz, power, pose(), 400_000_000, 1_000_000_000, 3.0, 36, True, np.array([-6.0, 0.5, 0.75]))
 
 
 def shape(points: int = 2, class_name: str = "car") -> Shape:
@@ -44,7 +44,8 @@ def fused_cloud(points: int = 50) -> FusedCloud:
     rng = np.random.default_rng(1)
     xyz = rng.normal(0, 3, (points, 3)).astype(np.float32)
     numbers = np.arange(points, dtype=np.int64)
-    return FusedCloud(xyz, rng.normal(0, 9, points).astype(np.float32), numbers, pose(), 4, 9, 2.5, 61, False)
+    power = rng.normal(0, 9, points).astype(np.float32)
+    return FusedCloud(xyz, power, numbers, pose(), 4, 9, 2.5, 61, False, np.array([1.25, 0.0, 0.125]))
 
 
 def heatmap(radar: RadarId = "horizontal", t_ns: int = 5) -> Heatmap:

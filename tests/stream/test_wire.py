@@ -97,6 +97,10 @@ def test_cloud_comes_back() -> None:
     message = sent(DRAFTS["cloud"])
     assert isinstance(message, CloudMessage)
     assert_same(message.cloud, fused_cloud())
+    unknown = replace(fused_cloud(), sensor_m=np.full(3, np.nan))
+    silent = sent(convert.encode_cloud(unknown))
+    assert isinstance(silent, CloudMessage)
+    assert np.isnan(silent.cloud.sensor_m).all()
     assert message.header.flags == FLAG_CUT_WINDOW
 
 
