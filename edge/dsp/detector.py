@@ -14,7 +14,7 @@ from edge.dsp.interpolation import PARABOLA
 from edge.dsp.kernels_cfar import mean_decisions, mean_peaks, rank_decisions_kernel, rank_peaks_kernel, ring_mean_kernel
 from edge.dsp.kernels_detect import refine, strongest
 from edge.dsp.threshold import cfar_scale, os_rank
-from edge.frames import Detections, Float32, Heatmap
+from edge.frames import Detections, Float32, Heatmap, PointResponse
 
 if TYPE_CHECKING:
     from edge.rig import Radar
@@ -64,7 +64,9 @@ class Detector:
 
     The noise around a cell comes from a ring in range and angle, wrapped in angle, cut at both ends of range and at
     ``min_range_m``; each number of remaining cells has its own factor for the same designed probability. The design
-    holds for independent exponential cells; a heatmap's cells are correlated by windows and zero padding.
+    holds for independent exponential cells; a heatmap's cells are correlated by windows and zero padding. Decisions are
+    made on the heatmap's power; maxima are sought and interpolated in the power as received, before the compensation of
+    the antenna pattern, which would draw the peak of a wide lobe aside.
 
     Args:
         radar: which radar; only its identity is used, axes come with the heatmap.
@@ -78,6 +80,7 @@ class Detector:
         self._ring = (settings.guard_angle, settings.train_angle, settings.guard_range, settings.train_range)
         self._shape = (0, 0)
         self._ends_m = (np.nan, np.nan)
+        self._response: PointResponse | None = None
         self._axes = np.zeros(7)
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
         self._index = np.zeros(settings.max_detections, dtype=np.int64)
@@ -98,6 +101,7 @@ class Detector:
             ConfigError: the ring does not fit onto the angle axis.
         """
         self._prepare(heatmap)
+        self._look_up(heatmap.response)
         count = self._find(heatmap.power)
         kept = strongest(heatmap.power, self._cells, count, self.settings.max_detections, self._value, self._index)
         self.cut = count - kept
@@ -149,8 +153,22 @@ class Detector:
         self._padded = np.full((angles, ranges + 2 * self.settings.train_range), -1.0, dtype=np.float32)
         self._mark = np.zeros(ranges, dtype=np.float32)
         self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
-        self._unit_gain = np.ones(angles, dtype=np.float32)
+        self._pattern = np.ones(angles, dtype=np.float32)
+        self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, None
+        self._axes[4:] = 0.0
         self._shape, self._ends_m = (angles, ranges), ends_m
+
+    def _look_up(self, response: PointResponse | None) -> None:
+        """What a point looks like, taken over only when it is another one than the last heatmap's."""
+        if response is self._response:
+            return
+        self._pattern[:] = 1.0
+        self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, response
+        self._axes[4:] = 0.0
+        if response is not None:
+            np.divide(1.0, response.gain, out=self._pattern)
+            self._range_fit, self._angle_fit = response.range_fit, response.angle_fit
+            self._axes[4:] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
 
     def _estimate(self, power: Float32) -> None:
         tables = self._tables
@@ -161,27 +179,23 @@ class Detector:
         tables = self._tables
         if self.settings.kind == "ca":
             self._estimate(power)
-            found = mean_peaks(power, self._noise, tables.factor, tables.first, self._cells, self._estimates)
+            found = mean_peaks(
+                *(power, self._pattern, self._noise, tables.factor, tables.first, self._cells, self._estimates)
+            )
         else:
             found = self._rank_peaks(
-                *(power, tables.first, tables.factor, tables.allowed, self._padded, self._mark),
+                *(power, self._pattern, tables.first, tables.factor, tables.allowed, self._padded, self._mark),
                 *(self._scratch, self._scratch.view(np.int32), self._cells, self._estimates),
             )
         return int(found)
 
     def _refine(self, heatmap: Heatmap, count: int) -> None:
-        response, range_m, cosine = heatmap.response, heatmap.range_m, heatmap.direction_cosine
+        range_m, cosine = heatmap.range_m, heatmap.direction_cosine
         last = len(range_m) - 1
         self._axes[0], self._axes[1] = range_m[0], (float(range_m[last]) - float(range_m[0])) / last
         self._axes[2] = cosine[0]
         self._axes[3] = (float(cosine[-1]) - float(cosine[0])) / (len(cosine) - 1)
-        gain, range_fit, angle_fit = self._unit_gain, PARABOLA, PARABOLA
-        self._axes[4:] = 0.0
-        if response is not None:
-            gain, range_fit, angle_fit = response.gain, response.range_fit, response.angle_fit
-            self._axes[4], self._axes[5] = response.range_bias_m2, response.cosine_bias_m
-            self._axes[6] = response.focus_inverse_m
         refine(
-            *(heatmap.power, gain, self._cells, self._index, self._estimates, count),
-            *(range_fit, angle_fit, self._axes, self._columns),
+            *(heatmap.power, self._pattern, self._cells, self._index, self._estimates, count),
+            *(self._range_fit, self._angle_fit, self._axes, self._columns),
         )

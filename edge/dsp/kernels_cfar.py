@@ -78,27 +78,29 @@ def mean_decisions(power, noise, factor, first, decided):  # type: ignore[no-unt
 
 
 @njit(inline="always")
-def _is_peak(power, a, r):  # type: ignore[no-untyped-def]
-    """Largest of its 3 x 3 neighbourhood; of equal neighbours the first in raster order is the peak."""
+def _is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
+    """Largest received power of its 3 x 3 neighbourhood; of equal neighbours the first in raster order is the peak."""
     angles, ranges = power.shape
-    centre = power[a, r]
+    centre = power[a, r] * pattern[a]
     for da in range(-1, 2):
         row = (a + da + angles) % angles
         for dr in range(-1, 2):
             c = r + dr
             if (da != 0 or dr != 0) and 0 <= c < ranges:
-                value = power[row, c]
+                value = power[row, c] * pattern[row]
                 if value > centre or (value == centre and (row < a or (row == a and c < r))):
                     return False
     return True
 
 
-@njit(int64(float32[:, ::1], float32[:, ::1], float32[::1], int64, int64[::1], float32[::1]), **OPTIONS)
-def mean_peaks(power, noise, factor, first, cells, estimate):  # type: ignore[no-untyped-def]
-    """Local maxima above the threshold of a noise map.
+@njit(int64(float32[:, ::1], float32[::1], float32[:, ::1], float32[::1], int64, int64[::1], float32[::1]), **OPTIONS)
+def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: ignore[no-untyped-def]
+    """Local maxima of the received power among the cells above the threshold of a noise map.
 
     Args:
-        power, noise: [A, R].
+        power: [A, R], compensated for the antenna pattern.
+        pattern: [A], received power = power * pattern.
+        noise: [A, R].
         factor: [R].
         first: first tested range cell.
         cells: int64 [A R / 4], receives flat indices a R + r.
@@ -115,7 +117,7 @@ def mean_peaks(power, noise, factor, first, cells, estimate):  # type: ignore[no
             above += float32(1) if power[a, c] > factor[c] * noise[a, c] else float32(0)
         if above > float32(0):
             for r in range(first, ranges):
-                if power[a, r] > factor[r] * noise[a, r] and _is_peak(power, a, r):
+                if power[a, r] > factor[r] * noise[a, r] and _is_peak(power, pattern, a, r):
                     cells[count] = a * ranges + r
                     estimate[count] = noise[a, r]
                     count += 1
@@ -191,15 +193,16 @@ def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, all
 
 
 @njit(inline="always")
-def _mark_peaks(power, a, mark):  # type: ignore[no-untyped-def]
-    """For every range cell of one row: 2 larger than all 8 neighbours, 1 as large as the largest, 0 smaller."""
+def _mark_peaks(power, pattern, a, mark):  # type: ignore[no-untyped-def]
+    """For every range cell of one row: 2 received more than all 8 neighbours, 1 as much as the largest, 0 less."""
     angles, ranges = power.shape
     above, below = (a + angles - 1) % angles, (a + 1) % angles
+    up, here, down = pattern[above], pattern[a], pattern[below]
     for r in range(1, ranges - 1):
-        left = max(max(power[above, r - 1], power[a, r - 1]), power[below, r - 1])
-        right = max(max(power[above, r + 1], power[a, r + 1]), power[below, r + 1])
-        largest = max(max(left, right), max(power[above, r], power[below, r]))
-        centre = power[a, r]
+        higher = max(max(power[above, r - 1], power[above, r]), power[above, r + 1]) * up
+        lower = max(max(power[below, r - 1], power[below, r]), power[below, r + 1]) * down
+        largest = max(max(higher, lower), max(power[a, r - 1], power[a, r + 1]) * here)
+        centre = power[a, r] * here
         mark[r] = float32(2) if centre > largest else (float32(1) if centre == largest else float32(0))
     mark[0], mark[ranges - 1] = float32(1), float32(1)
 
@@ -211,24 +214,24 @@ def rank_peaks_kernel(guard_angle: int, train_angle: int, guard_range: int, trai
     Args:
         guard_angle, train_angle, guard_range, train_range: half widths in cells.
     Returns:
-        kernel(power [A, R], first, factor float32 [R], allowed int64 [R] = N - k, padded [A, R + 2 train_range] of -1,
-        mark float32 [R], scratch float32 [cells of the box], bits (scratch as int32), cells, estimate) -> peaks found;
-        the last two as in ``mean_peaks``, the noise is x_(k).
+        kernel(power [A, R], pattern [A], first, factor float32 [R], allowed int64 [R] = N - k, padded [A, R + 2
+        train_range] of -1, mark float32 [R], scratch float32 [cells of the box], bits (scratch as int32), cells,
+        estimate) -> peaks found; as in ``mean_peaks``, but the noise is x_(k).
     """
     signature = int64(
-        *(float32[:, ::1], int64, float32[::1], int64[::1], float32[:, ::1], float32[::1], float32[::1], int32[::1]),
-        *(int64[::1], float32[::1]),
+        *(float32[:, ::1], float32[::1], int64, float32[::1], int64[::1], float32[:, ::1], float32[::1]),
+        *(float32[::1], int32[::1], int64[::1], float32[::1]),
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(power, first, factor, allowed, padded, mark, scratch, bits, cells, estimate):  # type: ignore[no-untyped-def]
+    def kernel(power, pattern, first, factor, allowed, padded, mark, scratch, bits, cells, estimate):  # type: ignore[no-untyped-def]
         angles, ranges = power.shape
         count = 0
         _pad(power, first, train_range, padded)
         for a in range(angles):
-            _mark_peaks(power, a, mark)
+            _mark_peaks(power, pattern, a, mark)
             for r in range(first, ranges):
-                if mark[r] == float32(0) or (mark[r] == float32(1) and not _is_peak(power, a, r)):
+                if mark[r] == float32(0) or (mark[r] == float32(1) and not _is_peak(power, pattern, a, r)):
                     continue
                 if _exceeds_rank(
                     padded, a, r, guard_angle, train_angle, guard_range, train_range, factor[r], allowed[r]

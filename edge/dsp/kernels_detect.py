@@ -74,13 +74,22 @@ def _offset(minus, centre, plus, spread, fit):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _amplitude(power, gain, a, r):  # type: ignore[no-untyped-def]
-    """Amplitude of a cell without the antenna's compensation; r outside the map gives 0."""
+def _amplitude(power, pattern, a, r):  # type: ignore[no-untyped-def]
+    """Received amplitude of a cell; r outside the map gives 0."""
     angles, ranges = power.shape
     row = (a + angles) % angles
     if r < 0 or r >= ranges:
         return 0.0
-    return np.sqrt(float64(power[row, r]) / float64(gain[row]))
+    return np.sqrt(float64(power[row, r]) * float64(pattern[row]))
+
+
+@njit(inline="always")
+def _pattern_at(pattern, a, offset):  # type: ignore[no-untyped-def]
+    """The antenna pattern ``offset`` rows beside row ``a``, linear between rows."""
+    angles = len(pattern)
+    beside = (a + 1) % angles if offset > 0.0 else (a + angles - 1) % angles
+    share = abs(offset)
+    return (1.0 - share) * float64(pattern[a]) + share * float64(pattern[beside])
 
 
 FIT = float64[::1]
@@ -94,12 +103,15 @@ FIT = float64[::1]
     ),
     **OPTIONS,
 )
-def refine(power, gain, cells, index, estimate, count, range_fit, angle_fit, axes, out):  # type: ignore[no-untyped-def]
-    """Positions and powers of detected cells.
+def refine(power, pattern, cells, index, estimate, count, range_fit, angle_fit, axes, out):  # type: ignore[no-untyped-def]
+    """Positions and powers of detected cells: interpolated as received, then compensated at their own direction.
+
+    The compensation grows with the angle, so that it shifts the peak of a wide lobe outwards: by more than half a bin
+    with eight elements.
 
     Args:
-        power: [A, R], compensated for the antenna gain.
-        gain: float32 [A], the compensation.
+        power: [A, R], compensated for the antenna pattern.
+        pattern: float32 [A], received power = power * pattern.
         cells, index: peak n is cell ``cells[index[n]]``.
         estimate: noise power, by place in ``cells``.
         count: peaks.
@@ -115,12 +127,12 @@ def refine(power, gain, cells, index, estimate, count, range_fit, angle_fit, axe
         a, r = cell // ranges, cell % ranges
         cosine = axes[2] + a * axes[3]
         spread = min(cosine * cosine, 1.0)
-        centre = _amplitude(power, gain, a, r)
+        centre = _amplitude(power, pattern, a, r)
         dr, height_r = _offset(
-            _amplitude(power, gain, a, r - 1), centre, _amplitude(power, gain, a, r + 1), spread, range_fit
+            _amplitude(power, pattern, a, r - 1), centre, _amplitude(power, pattern, a, r + 1), spread, range_fit
         )
         da, height_a = _offset(
-            _amplitude(power, gain, a - 1, r), centre, _amplitude(power, gain, a + 1, r), 0.0, angle_fit
+            _amplitude(power, pattern, a - 1, r), centre, _amplitude(power, pattern, a + 1, r), 0.0, angle_fit
         )
         range_m, cosine = axes[0] + (r + dr) * axes[1], cosine + da * axes[3]
         across = max(1.0 - cosine * cosine, 0.0)
@@ -128,7 +140,8 @@ def refine(power, gain, cells, index, estimate, count, range_fit, angle_fit, axe
         focused = axes[6] if axes[6] >= 0.0 else 0.5 * inverse
         cosine += axes[5] * (0.5 * across * inverse - focused)
         cosine -= period * np.floor(cosine / period + 0.5)
-        peak = float64(power[a, r]) * height_r * height_r * height_a * height_a
+        amplitude = centre * height_r * height_a
+        peak = amplitude * amplitude / _pattern_at(pattern, a, da)
         out[0, n] = range_m - axes[4] * across * inverse
         out[1, n] = cosine
         out[2, n] = 10.0 * np.log10(peak)

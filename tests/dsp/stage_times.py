@@ -39,10 +39,12 @@ def main(count: int) -> None:
         "imager 1.5 m/s": lambda: imager.process(frame, np.array([0.0, 1.5, 0.0])),
         "imager 3 m/s": lambda: imager.process(frame, np.array([0.0, 3.0, 0.0])),
         "ring mean": lambda: ca._estimate(power),
-        "peaks": lambda: mean_peaks(power, ca._noise, tables.factor, tables.first, ca._cells, ca._estimates),
+        "peaks": lambda: mean_peaks(
+            *(power, ca._pattern, ca._noise, tables.factor, tables.first, ca._cells, ca._estimates)
+        ),
         "detector CA": lambda: ca.process(heatmap),
         "peaks OS": lambda: os_._rank_peaks(
-            *(power, rank.first, rank.factor, rank.allowed, os_._padded, os_._mark),
+            *(power, os_._pattern, rank.first, rank.factor, rank.allowed, os_._padded, os_._mark),
             *(os_._scratch, os_._scratch.view(np.int32), os_._cells, os_._estimates),
         ),
         "detector OS": lambda: os_.process(heatmap),
