@@ -35,6 +35,23 @@ class Tally:
                 self.shapes[shape.identity] = shape
 
 
+class Narrator:
+    """A sink that prints one line for every window and every shape as they come."""
+
+    def frame(self, result: FrameResult) -> None:
+        """Frames come too fast to print."""
+
+    def window(self, result: WindowResult) -> None:
+        """Print what the window gave."""
+        from tqdm import tqdm
+
+        cloud = result.cloud
+        whole = "" if cloud.complete else ", cut short"
+        tqdm.write(f"window: {len(cloud)} points of {cloud.frames} frames, {cloud.travel_m:.2f} m of travel{whole}")
+        for shape in result.shapes:
+            tqdm.write(f"shape:  {_shape_line(shape)}")
+
+
 def shape_as_dict(shape: Shape) -> dict[str, Any]:
     """A shape without its points."""
     extent = shape.fine_m.max(axis=0) - shape.fine_m.min(axis=0)

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edge.commands.report import Tally, as_dict, lines
+from edge.commands.report import Narrator, Tally, as_dict, lines
 from edge.completion.manifest import find_model
 from edge.completion.model import CompletionModel
 from edge.frames import RADARS, Float32, Pose, RadarFrame
@@ -24,6 +25,7 @@ from edge.sources.base import Loss
 from edge.stream.publisher import Publisher
 from edge.stream.wire import Source
 from edge.version import version
+from edge.warm import warm_up
 
 
 def add_arguments(parser: argparse.ArgumentParser, speed: str) -> None:
@@ -91,7 +93,7 @@ class Session:
         self._stack = ExitStack()
         model, more = load_model(rig)
         self.notes += more
-        sinks: list[Sink] = [self.tally]
+        sinks: list[Sink] = [self.tally] if args.json else [self.tally, Narrator()]
         self._publishing: PublishingSink | None = None
         if not args.no_publish:
             self._publishing = self._publisher(source_kind)
@@ -110,12 +112,18 @@ class Session:
             settings = replace(settings, endpoints=tuple(self._args.endpoint))
         publisher = Publisher(settings, self.rig.config_hash, self.rig.calibration_hash, kind)
         self._stack.callback(publisher.close)
-        if not self._args.json:
-            print(f"publishing on {', '.join(publisher.endpoints)}", flush=True)
+        self._say(f"publishing on {', '.join(publisher.endpoints)}")
         return PublishingSink(publisher, version())
+
+    def _say(self, text: str) -> None:
+        if not self._args.json:
+            print(text, flush=True)
 
     def run(self, source: Iterable[RadarFrame | Pose | Loss], total: int | None) -> list[Path]:
         """Play the source to its end; returns the pictures that were written."""
+        start_s = time.monotonic()
+        warm_up(self.rig)
+        self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
         with self._stack:
             play(source, self.pipeline, self._speed, total, show_progress=not self._args.json)
             if self._publishing is not None:

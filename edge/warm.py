@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles, or loads from Numba's cache, every kernel that a rig's pipeline will call, before the first real frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from edge.frames import Pose, RadarFrame
+from edge.pipeline import Pipeline
+from edge.rig import Rig
+
+FRAMES = 3
+CODES = 64
+"""Size of the noise, in ADC codes."""
+P_FA = 0.05
+"""Enough false alarms to have detections, pairs and points."""
+
+
+def warm_up(rig: Rig) -> dict[str, float]:
+    """Run a few frames of noise through a pipeline of their own.
+
+    Args:
+        rig: its settings decide which kernels are compiled.
+    Returns:
+        Stage -> longest time in milliseconds; seconds when a kernel was compiled, a few milliseconds from the cache.
+    """
+    settings = replace(
+        rig.settings,
+        cfar=replace(rig.settings.cfar, p_fa=P_FA),
+        objects=replace(rig.settings.objects, core_points=1, min_points=1),
+    )
+    pipeline = Pipeline(replace(rig, settings=settings), None)
+    rng = np.random.default_rng(0)
+    for number in range(FRAMES):
+        t_ns = (number + 1) * round(1e9 * max(r.schedule.frame_period_s for r in rig.radars.values()))
+        pipeline.feed(Pose(t_ns, np.array([0.01 * number, 0.0, rig.geometry.height_m]), np.array([0.0, 0.0, 0.0, 1.0])))
+        for radar, board in rig.radars.items():
+            layout = board.schedule.layout
+            adc = rng.integers(-CODES, CODES, layout.shape, dtype=np.int16)
+            pipeline.feed(RadarFrame(radar, number, t_ns, adc, layout))
+    pipeline.finish()
+    return {stage: time.max_us / 1e3 for stage, time in pipeline.times.summary().items()}
