@@ -17,8 +17,7 @@ TOLERANCE_M = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Frames ``first`` to ``last`` (both included); their points [n, 3] and the rig's mean position [3] seen from the first
-    pose, float64."""
+    """Frames ``first`` to ``last``, both included; points [n, 3] and mean rig position [3] seen from the first."""
 
     first: int
     last: int
