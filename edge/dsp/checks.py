@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import CaptureError
-from edge.frames import Layout, LossCause, RadarFrame
+from edge.frames import LossCause, RadarFrame
 
 
 class FrameRejected(CaptureError):  # noqa: N818 - it is a verdict on the frame, named as in the architecture
@@ -62,20 +63,19 @@ def reject_saturated(frame: RadarFrame, share: float, allowed: float) -> FrameRe
     )
 
 
-def dead_names(dead: NDArray[np.uint8], layout: Layout) -> tuple[str, ...]:
+def dead_names(dead: NDArray[np.uint8], transmitters: Sequence[int]) -> tuple[str, ...]:
     """Names of dead channels, whole receivers and whole transmitters first.
 
     Args:
         dead: [slots, receivers], not zero where the channel is dead.
-        layout: of the frame; in a cascade slot s fires TX ``slots - s``, elsewhere slots are named in firing order.
+        transmitters: transmitter of each slot, numbered as on the board (``Schedule.transmitters``).
     Returns:
         For example ("RX5", "TX3", "TX1 RX2").
     """
-    transmitter = [layout.slots - s if layout.kind == "cascade" else s + 1 for s in range(layout.slots)]
     by_receiver = np.asarray(dead.all(axis=0))
     by_slot = np.asarray(dead.all(axis=1) & (not by_receiver.all()))
     names = [f"RX{r + 1}" for r in np.flatnonzero(by_receiver)]
-    names += [f"TX{transmitter[s]}" for s in np.flatnonzero(by_slot)]
+    names += [f"TX{transmitters[s]}" for s in np.flatnonzero(by_slot)]
     single = dead.astype(np.bool_) & ~by_receiver[None, :] & ~by_slot[:, None]
-    names += [f"TX{transmitter[s]} RX{r + 1}" for s, r in np.argwhere(single)]
+    names += [f"TX{transmitters[s]} RX{r + 1}" for s, r in np.argwhere(single)]
     return tuple(names)

@@ -308,7 +308,7 @@ class Imager:
         dead = dead_channels(
             adc, self._channel_start, layout.samples, self._channel_step, self._channel_word, self._dead
         )
-        names = dead_names(self._dead, layout) if dead else ()
+        names = dead_names(self._dead, self.radar.schedule.transmitters) if dead else ()
         self.last_report = FrameReport(loops, share, names)
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from dsp_radars import cascade_radar, place, single_chip_radar
 
+from edge.array import array_for
 from edge.config import AntennaSettings, HeatmapSettings
 from edge.dsp.checks import FrameRejected
 from edge.dsp.imager import Imager
@@ -94,7 +95,21 @@ def test_dead_receiver_of_a_single_chip_is_named():
     samples[:, :, 2] = 3 - 4j
     samples[:, 1, 0] = 0
     imager.process(dataclasses.replace(frame, adc=pack(samples, frame.layout)))
-    assert imager.last_report.dead == ("RX3", "TX2 RX1")
+    assert imager.last_report.dead == ("RX3", "TX3 RX1"), "an AWR1843 fires TX1, TX3, TX2"
+
+
+@pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1), (2, 3, 1)])
+def test_dead_transmitters_have_the_numbers_of_the_schedule(order):
+    board = single_chip_radar()
+    schedule = dataclasses.replace(board.schedule, transmitters=order)
+    radar = dataclasses.replace(board, schedule=schedule, array=array_for("AWR1843", order))
+    frame = make_frame(radar, [place(4.0, 5)], 500.0, 0, 0, noise_lsb=10.0)
+    samples = unpack(frame.adc, frame.layout)
+    samples[:, 0] = 0
+    samples[:, 2, 1] = 0
+    imager = Imager(radar, SETTINGS["dca1000"], AntennaSettings())
+    imager.process(dataclasses.replace(frame, adc=pack(samples, frame.layout)))
+    assert imager.last_report.dead == (f"TX{order[0]}", f"TX{order[2]} RX2")
 
 
 def test_a_foreign_layout_is_refused():
