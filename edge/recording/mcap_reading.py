@@ -2,8 +2,8 @@
 """Walks the records of an uncompressed MCAP file that may be cut or damaged anywhere.
 
 The ``mcap`` package's readers stop with various errors at the first cut record, copy messages twice and allocate what
-a damaged length asks for. This one gives every message of every chunk whose CRC holds, then the whole messages of a
-cut last chunk, and never allocates more than the file is long. Format: https://mcap.dev/spec.
+a damaged length asks for. This one gives every message of every chunk whose CRC holds, nothing that no CRC vouches for,
+and never allocates more than the file is long. Format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -43,14 +43,12 @@ class ReadReport:
 
     Args:
         messages: messages given.
-        unverified: of these, from a cut chunk, whose CRC cannot be checked.
         damaged_chunks: chunks left out: their CRC or their structure is wrong.
         bytes_lost: bytes of damaged chunks and of the cut end.
         missing: messages that the summary counts and the file does not give; 0 in a file without its end.
     """
 
     messages: int = 0
-    unverified: int = 0
     damaged_chunks: int = 0
     bytes_lost: int = 0
     missing: int = 0
@@ -163,25 +161,25 @@ class McapFile:
             offset = body + length
 
     def _chunk_messages(self, record: _Record, channels: dict[int, str], report: ReadReport) -> Iterator[Message]:
-        data, crc_holds = self._chunk_data(record)
-        if data is None or not (crc_holds or not record.whole):
+        data = self._chunk_data(record) if record.whole else None
+        if data is None:
             report.damaged_chunks += record.whole
             report.bytes_lost += record.available
-            return
-        before = report.messages
-        yield from self._inner(data, channels, report)
-        if not record.whole:
-            report.unverified += report.messages - before
+        else:
+            yield from self._inner(data, channels, report)
 
-    def _chunk_data(self, record: _Record) -> tuple[memoryview | None, bool]:
-        """Records of a chunk, as far as they are in the file, and whether their CRC holds."""
-        if record.length > LARGEST_CHUNK or record.available < CHUNK.size:
-            return None, False
-        head = self._read(record.offset, min(record.available, CHUNK.size + 64))
+    def _chunk_data(self, record: _Record) -> memoryview | None:
+        """Records of a chunk; None when its structure or its CRC is wrong."""
+        if not CHUNK.size + 8 <= record.length <= LARGEST_CHUNK:
+            return None
+        head = self._read(record.offset, min(record.length, CHUNK.size + 40))
         _, _, _, crc, name_length = CHUNK.unpack_from(head)
         start = CHUNK.size + name_length + 8
-        if name_length > 32 or len(head) < start:
-            return None, False
+        if len(head) < start:
+            return None
+        (length,) = struct.unpack_from("<Q", head, start - 8)
+        if length != record.length - start:
+            return None
         if name_length:
             raise RecordingError(
                 f"{self.path}: compressed chunk",
@@ -189,11 +187,8 @@ class McapFile:
                 allowed="uncompressed recordings",
                 action="decompress it: mcap compress --compression none",
             )
-        (length,) = struct.unpack_from("<Q", head, start - 8)
-        if length != record.length - start:
-            return None, False
-        data = self._read_reused(record.offset + start, record.available - start)
-        return data, record.whole and len(data) == length and (crc == 0 or zlib.crc32(data) == crc)
+        data = self._read_reused(record.offset + start, length)
+        return data if len(data) == length and (crc == 0 or zlib.crc32(data) == crc) else None
 
     def _inner(self, data: memoryview, channels: dict[int, str], report: ReadReport) -> Iterator[Message]:
         """Messages of consecutive records; ends at the first that is not whole."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appends uncompressed MCAP chunks to a file; large messages go from the caller's memory to the file without a copy.
+"""Appends uncompressed MCAP chunks to a file; frames go from the caller's memory to the file without a copy.
 
 The ``mcap`` package's writer copies a message five times and keeps an object for every chunk; here its record types
 write everything small, and chunks are gathered by ``writev``. Format: https://mcap.dev/spec.
@@ -32,15 +32,14 @@ from mcap.records import (
     SummaryOffset,
 )
 
+RECORD_HEAD_BYTES = 9
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_HEAD = struct.Struct("<BQQQQIIQ")
 """Opcode, length, first and last log time, uncompressed size, CRC, length of the compression's name (0), size."""
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time."""
-SMALL_BYTES = 64 * 1024
-"""Smaller messages are copied and wait for company."""
 CHUNK_BYTES = 256 * 1024
-"""A chunk is closed beyond this."""
+"""A chunk of small messages is closed beyond this."""
 
 Buffer = bytes | bytearray | memoryview
 
@@ -147,20 +146,17 @@ class McapWriter:
         self._summary[Opcode.CHANNEL] += record
         return self._statistics.channel_count
 
-    def add_message(self, channel: int, t_ns: int, parts: Sequence[Buffer], sequence: int = 0) -> None:
-        """Append a message whose payload is ``parts`` joined; a large one is in the file when this returns."""
-        size = sum(map(len, parts))
-        head = MESSAGE_HEAD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size - 9 + size, channel, sequence, t_ns, t_ns)
-        self._index.setdefault(channel, []).append((t_ns, len(self._small)))
-        self._times_ns.append(t_ns)
-        self._small += head
-        if size >= SMALL_BYTES:
-            self._write_chunk(parts)
-        else:
-            for part in parts:
-                self._small += part
-            if len(self._small) > CHUNK_BYTES:
-                self._write_chunk(())
+    def add_message(self, channel: int, t_ns: int, payload: Buffer) -> None:
+        """Copy a small message into the chunk in progress."""
+        self._begin_message(channel, t_ns, len(payload), 0)
+        self._small += payload
+        if len(self._small) > CHUNK_BYTES:
+            self._write_chunk(())
+
+    def write_message(self, channel: int, t_ns: int, parts: Sequence[Buffer], sequence: int) -> None:
+        """Write a message whose payload is ``parts`` joined, and what waited before it, as one chunk, at once."""
+        self._begin_message(channel, t_ns, sum(map(len, parts)), sequence)
+        self._write_chunk(parts)
 
     def flush(self) -> None:
         """Write the chunk in progress, if any."""
@@ -185,13 +181,22 @@ class McapWriter:
             crc = zlib.crc32(part, crc)
         self._file.append([*parts, _bytes_of(Footer(start, offset, crc)), MAGIC])
 
+    def _begin_message(self, channel: int, t_ns: int, size: int, sequence: int) -> None:
+        self._index.setdefault(channel, []).append((t_ns, len(self._small)))
+        self._times_ns.append(t_ns)
+        self._small += MESSAGE_HEAD.pack(
+            Opcode.MESSAGE, MESSAGE_HEAD.size - RECORD_HEAD_BYTES + size, channel, sequence, t_ns, t_ns
+        )
+
     def _write_chunk(self, large: Sequence[Buffer]) -> None:
         """One chunk of the small messages and the payload of a large one, and its index."""
         crc, size = zlib.crc32(self._small), len(self._small)
         for part in large:
             crc, size = zlib.crc32(part, crc), size + len(part)
         first, last = min(self._times_ns), max(self._times_ns)
-        head = CHUNK_HEAD.pack(Opcode.CHUNK, CHUNK_HEAD.size - 9 + size, first, last, size, crc, 0, size)
+        head = CHUNK_HEAD.pack(
+            Opcode.CHUNK, CHUNK_HEAD.size - RECORD_HEAD_BYTES + size, first, last, size, crc, 0, size
+        )
         offset, length = self._file.position, len(head) + size
         index, offsets = bytearray(), {}
         for channel, entries in self._index.items():

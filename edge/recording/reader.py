@@ -109,7 +109,6 @@ class RecordingReader:
             "truncated": self.truncated,
             "bytes_lost": self.report.bytes_lost,
             "damaged_chunks": self.report.damaged_chunks,
-            "unverified": self.report.unverified,
             "missing": self.report.missing,
             "t_start_ns": span_ns[0],
             "t_end_ns": span_ns[1],

@@ -8,7 +8,7 @@ import platform
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +17,7 @@ from edge.calibration import Calibration, Waveform, save_calibration
 from edge.errors import RecordingError
 from edge.frames import Pose, RadarFrame, RadarId
 from edge.recording import schema
-from edge.recording.mcap_writing import AppendFile, Buffer, McapWriter
+from edge.recording.mcap_writing import AppendFile, McapWriter
 from edge.rig import Radar, Rig
 
 FLUSH_PERIOD_S = 0.5
@@ -29,7 +29,8 @@ TEXT_SUFFIXES = (".toml", ".cfg", ".json", ".txt")
 class RecordingWriter:
     """Appends frames, poses and results to a new MCAP file; any thread may call.
 
-    Messages are kept in the order of the calls; callers write in time order.
+    Messages are kept in the order of the calls; callers write in time order. A frame, and everything before it, is in
+    the file when ``frame`` returns; poses and results wait for the next frame, at most half a second.
 
     Args:
         path: must not exist; the folder must.
@@ -76,18 +77,22 @@ class RecordingWriter:
                 action="record with the rig that the frames come from",
             )
         parts = (schema.frame_header(frame), frame.adc.reshape(-1).data.cast("B"))
-        self._append(self._frame_channel[frame.radar], frame.t_first_chirp_ns, parts, frame.number)
+        channel, sequence = self._frame_channel[frame.radar], frame.number & 0xFFFFFFFF
+        t_ns = _recordable(frame.t_first_chirp_ns)
+        self._append(lambda: self._writer.write_message(channel, t_ns, parts, sequence))
 
     def pose(self, pose: Pose) -> None:
         """Append a pose."""
-        self._append(self._pose_channel, pose.t_ns, (schema.encode_pose(pose),))
+        t_ns, payload = _recordable(pose.t_ns), schema.encode_pose(pose)
+        self._append(lambda: self._writer.add_message(self._pose_channel, t_ns, payload))
 
     def message(self, topic: str, payload: bytes, t_ns: int) -> None:
         """Append a result as the stream encodes it; RecordingError for a topic that is not in RESULT_TOPICS."""
         channel = self._result_channel.get(topic)
         if channel is None:
             raise RecordingError("topic of no result", value=topic, allowed=", ".join(schema.RESULT_TOPICS))
-        self._append(channel, t_ns, (payload,))
+        t_ns = _recordable(t_ns)
+        self._append(lambda: self._writer.add_message(channel, t_ns, payload))
 
     def flush(self) -> None:
         """Write what waits in memory: what was appended so far survives the death of this process."""
@@ -146,13 +151,11 @@ class RecordingWriter:
         }
         return frames, pose, results
 
-    def _append(self, channel: int, t_ns: int, parts: Sequence[Buffer], sequence: int = 0) -> None:
-        if not 0 <= t_ns < 2**63:
-            raise RecordingError("time cannot be recorded", value=t_ns, allowed="0..2^63-1 ns of CLOCK_MONOTONIC")
+    def _append(self, action: Callable[[], None]) -> None:
         with self._lock:
             self._require_open()
-            self._guarded(lambda: self._writer.add_message(channel, t_ns, parts, sequence & 0xFFFFFFFF))
             self._dirty = True
+            self._guarded(action)
 
     def _require_open(self) -> None:
         if self._failure:
@@ -193,6 +196,12 @@ class RecordingWriter:
             value=self._failure,
             action="free space or mend the disk, then start a new recording; what is in the file stays readable",
         )
+
+
+def _recordable(t_ns: int) -> int:
+    if not 0 <= t_ns < 2**63:
+        raise RecordingError("time cannot be recorded", value=t_ns, allowed="0..2^63-1 ns of CLOCK_MONOTONIC")
+    return t_ns
 
 
 def _attachments(rig: Rig) -> dict[str, bytes]:

@@ -46,7 +46,7 @@ def test_round_trip(tmp_path: Path, layout: Layout) -> None:
         assert info["duration_s"] == pytest.approx(11 * 0.02 + 0.015)
         assert json.loads(json.dumps(info))["rig"] == "rig"
         report = reader.verify()
-        assert (report.messages, report.damaged_chunks, report.bytes_lost, report.unverified) == (48, 0, 0, 0)
+        assert (report.messages, report.damaged_chunks, report.bytes_lost, report.missing) == (48, 0, 0, 0)
 
 
 @pytest.mark.parametrize("layout", [LAYOUT, BIG])
