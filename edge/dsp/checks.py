@@ -75,7 +75,7 @@ def dead_names(dead: NDArray[np.uint8], transmitters: Sequence[int]) -> tuple[st
     by_receiver = np.asarray(dead.all(axis=0))
     by_slot = np.asarray(dead.all(axis=1) & (not by_receiver.all()))
     names = [f"RX{r + 1}" for r in np.flatnonzero(by_receiver)]
-    names += [f"TX{transmitters[s]}" for s in np.flatnonzero(by_slot)]
+    names += [f"TX{transmitters[s]}" for s in np.flatnonzero(by_slot).tolist()]
     single = dead.astype(np.bool_) & ~by_receiver[None, :] & ~by_slot[:, None]
-    names += [f"TX{transmitters[s]} RX{r + 1}" for s, r in np.argwhere(single)]
+    names += [f"TX{transmitters[s]} RX{r + 1}" for s, r in np.argwhere(single).tolist()]
     return tuple(names)
