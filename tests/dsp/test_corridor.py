@@ -1,27 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real cascade capture: corner reflector and two straight walls of a corridor, with and without TI's calibration.
 
-The mounting's array sign is -1 here: only then x = r u shows the walls on the sides, and the uncalibrated reflector on
-the side, that the recording's description names. Left and right themselves cannot be decided from the data.
+Everything comes from the rig ``corridor``. Its array sign is -1: only then x = r u shows the walls on the sides, and
+the uncalibrated reflector on the side, that the description of the recording names. Left and right themselves cannot be
+decided from the data.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from dsp_radars import calibrated as with_calibration
-from dsp_radars import cascade_radar
-from scipy.io import loadmat
 
-from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.frames import RadarFrame
 from edge.reference.repack import split_loop_sum
+from edge.rig import load_rig
 
-LOOPS = 64
 REFLECTOR_M = 5.02
-FLAT = AntennaSettings(along_loss_db=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -30,58 +26,51 @@ def folder(radar_data):
 
 
 @pytest.fixture(scope="module")
-def frame(folder):
-    with np.load(folder / "adc_loop_sum.npz") as stored:
-        loop_sum = stored["adc_loop_sum"]
-    adc = split_loop_sum(loop_sum, LOOPS)
-    assert np.array_equal(adc.sum(axis=1, dtype=np.int64)[1, 4, :, 2], loop_sum[7, 6])
-    return RadarFrame("horizontal", 0, 0, adc, cascade_radar(loops=LOOPS).schedule.layout)
-
-
-def heatmap_of(radar, frame):
-    return Imager(radar, HeatmapSettings(), FLAT).process(frame)
+def rig(folder):
+    return load_rig("corridor").with_calibration("horizontal", folder / "calibration.mat")
 
 
 @pytest.fixture(scope="module")
-def calibrated(folder, frame):
-    """TI's formula on TI's matrices, rows turned into firing order; bins off by more than 10 of 5x are outliers."""
-    result = loadmat(folder / "calibration.mat", squeeze_me=True, struct_as_record=False)["calibResult"]
-    bins, peak = np.asarray(result.RangeMat, dtype=float), np.asarray(result.PeakValMat)
-    bins[np.abs(bins - np.median(bins)) > 10] = np.median(bins)
-    radar = with_calibration(
-        cascade_radar(loops=LOOPS, array_sign=-1),
-        gain=np.exp(1j * np.angle(peak[11, 0] / peak))[::-1].astype(np.complex64),
-        range_shift_bins=((bins - bins[11, 0]) / 5)[::-1],
-        reference_range_m=REFLECTOR_M,
-    )
-    return radar, heatmap_of(radar, frame)
+def frame(folder, rig):
+    with np.load(folder / "adc_loop_sum.npz") as stored:
+        loop_sum = stored["adc_loop_sum"]
+    layout = rig.radars["horizontal"].schedule.layout
+    adc = split_loop_sum(loop_sum, layout.loops)
+    assert np.array_equal(adc.sum(axis=1, dtype=np.int64)[1, 4, :, 2], loop_sum[7, 6])
+    return RadarFrame("horizontal", 0, 0, adc, layout)
+
+
+def heatmap_of(rig, frame):
+    return Imager(rig.radars["horizontal"], rig.settings.heatmap, rig.settings.antenna).process(frame)
+
+
+@pytest.fixture(scope="module")
+def calibrated(rig, frame):
+    return heatmap_of(rig, frame)
 
 
 @pytest.fixture(scope="module")
 def uncalibrated(frame):
-    return heatmap_of(cascade_radar(loops=LOOPS, array_sign=-1), frame)
+    return heatmap_of(load_rig("corridor"), frame)
 
 
-def near_reflector(heatmap):
-    """Strongest cell within 0.3 m of the reflector: degrees and dB."""
-    columns = np.abs(heatmap.range_m - REFLECTOR_M) < 0.3
-    part = heatmap.power[:, columns]
-    row = np.unravel_index(part.argmax(), part.shape)[0]
-    return float(np.degrees(np.arcsin(heatmap.direction_cosine[row]))), float(10 * np.log10(part.max()))
-
-
-def test_reflector_stands_at_its_range_straight_ahead(calibrated):
-    radar, heatmap = calibrated
-    found = Detector(radar, CfarSettings()).process(heatmap)
+def detected(rig, heatmap):
+    """The strongest detection within 0.3 m of the reflector's range: metres, degrees, dB."""
+    found = Detector(rig.radars["horizontal"], rig.settings.cfar).process(heatmap)
     near = np.flatnonzero(np.abs(found.range_m - REFLECTOR_M) < 0.3)[0]
-    assert found.range_m[near] == pytest.approx(5.02, abs=0.03)
-    assert np.degrees(np.arcsin(found.direction_cosine[near])) == pytest.approx(0.0, abs=0.3)
+    return found.range_m[near], np.degrees(np.arcsin(found.direction_cosine[near])), found.power_db[near]
 
 
-def test_without_calibration_the_reflector_wanders_and_fades(calibrated, uncalibrated):
-    angle_deg, power_db = near_reflector(uncalibrated)
-    assert angle_deg == pytest.approx(-2.9, abs=0.4)
-    assert near_reflector(calibrated[1])[1] - power_db > 5.0
+def test_reflector_stands_at_its_range_straight_ahead(rig, calibrated):
+    range_m, angle_deg, _ = detected(rig, calibrated)
+    assert range_m == pytest.approx(5.02, abs=0.03)
+    assert angle_deg == pytest.approx(0.0, abs=0.3)
+
+
+def test_without_calibration_the_reflector_wanders_and_fades(rig, calibrated, uncalibrated):
+    _, angle_deg, power_db = detected(rig, uncalibrated)
+    assert angle_deg == pytest.approx(-2.9, abs=0.3)
+    assert detected(rig, calibrated)[2] - power_db > 5.0
 
 
 def wall(heatmap, side, nearest_m, farthest_m, longest_m):
@@ -105,7 +94,7 @@ def wall(heatmap, side, nearest_m, farthest_m, longest_m):
 @pytest.mark.parametrize(("side", "expected_m", "longest_m"), [(1, 1.13, 4.0), (-1, -1.28, 2.9)])
 def test_walls_stand_where_they_were_measured(calibrated, side, expected_m, longest_m):
     """The right wall's echo is covered by stronger ones beyond 2.9 m."""
-    x_m, _, residual = wall(calibrated[1], side, 0.6, 2.0, longest_m)
+    x_m, _, residual = wall(calibrated, side, 0.6, 2.0, longest_m)
     close = np.abs(residual) < 0.1
     assert x_m == pytest.approx(expected_m, abs=0.05)
     assert close.mean() > 0.9
@@ -114,7 +103,7 @@ def test_walls_stand_where_they_were_measured(calibrated, side, expected_m, long
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_walls_are_straight_and_parallel(calibrated, side):
-    assert abs(wall(calibrated[1], side, 1.0, 1.5, 4.0)[1]) <= 0.03
+    assert abs(wall(calibrated, side, 1.0, 1.5, 4.0)[1]) <= 0.03
 
 
 def test_without_calibration_the_left_wall_smears(uncalibrated):
@@ -122,8 +111,7 @@ def test_without_calibration_the_left_wall_smears(uncalibrated):
     assert (np.abs(residual) < 0.1).mean() < 0.7
 
 
-def test_capture_is_not_swapped(frame):
+def test_capture_is_not_swapped(uncalibrated):
     """Power at positive over negative beat frequencies, leakage left out: about +10 dB for I first."""
-    heatmap = heatmap_of(cascade_radar(loops=LOOPS), frame)
-    profile = heatmap.power.sum(axis=0)
+    profile = uncalibrated.power.sum(axis=0)
     assert 10 * np.log10(profile[10:128].sum() / profile[128:-10].sum()) > 6.0
