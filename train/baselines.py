@@ -24,6 +24,13 @@ def middle(cloud: Float32) -> Float32:
     return center
 
 
+def place(cloud: Float32) -> Float32:
+    """Where the network puts its origin: on the ground under the middle of the bounding box, float32 [3]."""
+    center = middle(cloud)
+    center[2] = 0
+    return center
+
+
 def input_itself(sample: Sample) -> Float32:
     """The partial cloud as it is."""
     return sample.partial
@@ -35,7 +42,7 @@ def collapse(sample: Sample) -> Float32:
 
 
 class Bank:
-    """Training shapes, each placed as its own partial input was.
+    """Training shapes in the line-of-sight frame, each placed as its own partial input was.
 
     Args:
         dataset: training split.
@@ -47,19 +54,19 @@ class Bank:
     def __init__(self, dataset: CompletionDataset, shapes: int) -> None:
         require(len(CLASSES) <= shapes <= len(dataset), "bank", shapes, f"{len(CLASSES)}..{len(dataset)} shapes")
         samples = [dataset[index] for index in range(shapes)]
-        self.shapes = [sample.truth - middle(sample.partial) for sample in samples]
+        self.shapes = [sample.truth - place(sample.partial) for sample in samples]
         self.labels = np.array([sample.label for sample in samples])
 
     def class_mean(self, sample: Sample) -> Float32:
         """A cloud of the mean distribution of the sample's TRUE class about the input's middle (a help to it)."""
         own = [shape for shape, label in zip(self.shapes, self.labels, strict=True) if label == sample.label]
         each = -(-len(sample.truth) // len(own))
-        mean: Float32 = np.concatenate([shape[:each] for shape in own]) + middle(sample.partial)
+        mean: Float32 = np.concatenate([shape[:each] for shape in own]) + place(sample.partial)
         return mean
 
     def retrieve(self, sample: Sample) -> Float32:
         """The training shape whose surface is nearest to the partial input (Chamfer distance), put at its place."""
-        center = middle(sample.partial)
+        center = place(sample.partial)
         query = np.ascontiguousarray((sample.partial - center)[:_QUERY_POINTS])
         best, answer = np.inf, self.shapes[0]
         for shape in self.shapes:

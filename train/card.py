@@ -47,7 +47,9 @@ def write_card(
     parts = [
         f"# Model card: {name}",
         "Completes a sparse, noisy, partial cloud of a road user to 16,384 points at true scale, and names its class.\n"
-        "Cascaded PointNet encoder, coarse decoder, folding with local features (the paper's shape completion).",
+        "Cascaded PointNet encoder, coarse decoder, folding with local features (the paper's shape completion).\n"
+        "Input and output are in the line-of-sight frame: x horizontal and away from the sensor's mean position, z up "
+        "from the ground.",
         "## Training",
         f"{training['samples']} samples in {training['seconds']} s on {training['device']}, seed {training['seed']}; "
         f"{training['parameters']} parameters.\n{training['dataset']}.",

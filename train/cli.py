@@ -178,7 +178,8 @@ def _training(checkpoint: Checkpoint, scores: Scores) -> dict[str, Any]:
         "parameters": sum(value.numel() for value in checkpoint.average.values()),
         "device": f"{settings['device']} ({platform.machine()}, {settings['threads']} threads, other work beside it)",
         "dataset": "Partial clouds made from meshes on the fly (visible surface, holes, noise spheres, ghosts), "
-        "true scale, any yaw; simulated geometry, no radar data",
+        "true scale, any heading, seen along the line of sight (x) and over the ground (z = 0), both with errors; "
+        "simulated geometry, no radar data",
         "settings": settings,
         "metrics": {
             "split": "test",

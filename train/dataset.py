@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from edge.completion.sight import bearing_rad, turned
 from edge.config import require
 from edge.frames import Float32
 from train.objects.deform import DeformSettings, vary
@@ -36,8 +36,9 @@ class Sample:
     """One pair of input and truth.
 
     Args:
-        partial: float32 [n, 3], metres, n real points (never padded), ground z = 0, x and y from the centre (mean) of
-            the partial cloud, as in the runtime's object frame; in the box frame x and y from the centre of the truth.
+        partial: float32 [n, 3], metres, n real points (never padded), in the line-of-sight frame of
+            ``edge.completion.sight``: x away from the radar, ground z = 0, x and y from the middle of the partial
+            cloud's bounding box; in the box frame x along the object, x and y from the centre of the truth.
         truth: float32 [truth_points, 3], same frame, uniform by area, random order.
         label: index into CLASSES.
         object_id: "<class>/<name>".
@@ -62,7 +63,9 @@ class DatasetSettings:
         truth_points: points of the truth.
         perturbation, deformation: see there; deformation is applied in train only.
         box_frame: the variant with box priors: x along the object, origin at the centre of the complete shape on the
-            ground; the trainer scales to the unit sphere. Otherwise any yaw and the centre of the input.
+            ground; the trainer scales to the unit sphere. Otherwise the line-of-sight frame, the object at any heading.
+        sight_sigma_deg, ground_sigma_m: standard deviations of the errors of the line of sight and of the height of the
+            ground, as a calibration, a pose and a road that is not level bring them.
         epoch_samples: samples of one training epoch, classes in turn.
         evaluation_views: samples of every val and test object, azimuth sectors in turn.
         origin_share: chance of a collected, a procedural (library) and an own parametric object in train, by class;
@@ -80,6 +83,8 @@ class DatasetSettings:
     perturbation: PerturbSettings = field(default_factory=PerturbSettings)
     deformation: DeformSettings = field(default_factory=DeformSettings)
     box_frame: bool = False
+    sight_sigma_deg: float = 3.0
+    ground_sigma_m: float = 0.02
     epoch_samples: int = 20_000
     evaluation_views: int = 8
     origin_share: dict[ClassName, tuple[float, float, float]] = field(
@@ -95,6 +100,8 @@ class DatasetSettings:
     def __post_init__(self) -> None:
         require(1 <= self.min_points <= self.max_points, "dataset.min_points", self.min_points, "1..max_points")
         require(0 <= self.min_spread < 0.3, "dataset.min_spread", self.min_spread, "0..0.3")
+        require(self.sight_sigma_deg >= 0, "dataset.sight_sigma_deg", self.sight_sigma_deg, ">= 0 deg")
+        require(self.ground_sigma_m >= 0, "dataset.ground_sigma_m", self.ground_sigma_m, ">= 0 m")
         require(self.truth_points >= 1, "dataset.truth_points", self.truth_points, ">= 1")
         require(self.epoch_samples >= 1, "dataset.epoch_samples", self.epoch_samples, ">= 1")
         require(self.evaluation_views >= 1, "dataset.evaluation_views", self.evaluation_views, ">= 1")
@@ -171,7 +178,7 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         sector = index // len(CLASSES) if self.split == "train" else index % settings.evaluation_views
         diagonal = float(np.linalg.norm(mesh.size_m))
         for _ in range(_ATTEMPTS):
-            partial = perturb(mesh, self._perturbation, rng, sector % AZIMUTH_SECTORS)
+            partial, radar_m = perturb(mesh, self._perturbation, rng, sector % AZIMUTH_SECTORS)
             if len(partial) >= settings.min_points and _spread(partial) >= settings.min_spread * diagonal:
                 break
         else:
@@ -183,13 +190,19 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
             )
         truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
         if not settings.box_frame:
-            yaw = rng.uniform(0, 2 * math.pi)
-            c, s = math.cos(yaw), math.sin(yaw)
-            rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
-            partial, truth = partial @ rotation, truth @ rotation
-            center = np.append(partial[:, :2].mean(axis=0), 0).astype(np.float32)
-            partial, truth = partial - center, truth - center
+            partial, truth = self._as_seen(partial, truth, bearing_rad(mesh.object_id, radar_m, partial), rng)
         return Sample(np.ascontiguousarray(partial), np.ascontiguousarray(truth), mesh.label, mesh.object_id)
+
+    def _as_seen(
+        self, partial: Float32, truth: Float32, bearing: float, rng: np.random.Generator
+    ) -> tuple[Float32, Float32]:
+        """Both clouds in the line-of-sight frame, with the errors of its axis and of the ground."""
+        error_rad = np.radians(rng.normal(0, self.settings.sight_sigma_deg))
+        angle_rad = error_rad - bearing
+        partial, truth = turned(partial, angle_rad), turned(truth, angle_rad)
+        origin_m = (partial.max(axis=0) + partial.min(axis=0)) / 2
+        origin_m[2] = rng.normal(0, self.settings.ground_sigma_m)
+        return partial - origin_m, truth - origin_m
 
     def _generator(self, index: int) -> np.random.Generator:
         epoch = int(self._epoch[0]) if self.split == "train" else 0

@@ -93,13 +93,13 @@ def build(weights: _Weights) -> onnx.ModelProto:
 
 
 def _center(graph: _Graph) -> str:
-    """Points in network units about the middle of their bounding box; returns that middle [1, 3], metres."""
+    """Points in network units, x and y about the middle of their bounding box; returns that middle [1, 3], z 0."""
     graph.constant("scale", np.array(SCALE_M, np.float32))
     axis = graph.constant("rows", np.array([0], np.int64))
     graph.add("ReduceMax", ["points", axis], "high", keepdims=1)
     graph.add("ReduceMin", ["points", axis], "low", keepdims=1)
     graph.add("Add", ["high", "low"], "both_ends")
-    graph.add("Mul", ["both_ends", graph.constant("half", np.array(0.5, np.float32))], "center")
+    graph.add("Mul", ["both_ends", graph.constant("half", np.array([[0.5, 0.5, 0.0]], np.float32))], "center")
     graph.add("Sub", ["points", "center"], "centered")
     graph.add("Div", ["centered", "scale"], "unit")
     return "center"

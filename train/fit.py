@@ -166,6 +166,8 @@ class Trainer:
                 "truth_points": data.truth_points,
                 "max_points": data.max_points,
                 "box_frame": data.box_frame,
+                "sight_sigma_deg": data.sight_sigma_deg,
+                "ground_sigma_m": data.ground_sigma_m,
             }
         }
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from edge.completion.manifest import InputFrame
 from edge.frames import Float32
 from train.dataset import CLASSES
 from train.evaluate import OnnxModel
@@ -19,10 +20,7 @@ from train.network import COARSE_POINTS, FINE_POINTS
 
 SCHEMA = 1
 FULL, SMALL = "model.onnx", "model.int8.onnx"
-FRAME = (
-    "metres, axes of the odometry frame (z up), any origin: the network centres its input itself; "
-    "trained on z of the ground = 0 and any yaw"
-)
+FRAME: InputFrame = "line_of_sight"
 _FINE_ROWS = 1024
 _JITTER_M = 1e-5
 _LEAST_TOLERANCE_M = {FULL: 1e-3, SMALL: 1e-2}

@@ -73,8 +73,9 @@ def patch_grid() -> Tensor:
 class CompletionNetwork(nn.Module):
     """Network of the paper's section on shape completion, with PCN's channel counts where the paper gives none.
 
-    Invariant to the order and to repetition of the input points; a shift of the input shifts the output.
-    The input is centred on the middle of its own bounding box and divided by a constant, so it works in true metres.
+    Input and output are in the line-of-sight frame (``edge.completion.sight``) in true metres. Invariant to the order
+    and to repetition of the input points. A shift of the input in the plane shifts the output: x and y are centred on
+    the middle of the input's bounding box; z stays the height above the ground. All are divided by a constant.
 
     Args:
         width: channels.
@@ -102,12 +103,10 @@ class CompletionNetwork(nn.Module):
         """Make the untrained network answer with this shape: it becomes the bias of the coarse decoder's last layer.
 
         Args:
-            shape_m: float32 [1024, 3], metres; it is centred on the middle of its bounding box.
+            shape_m: float32 [1024, 3], metres; x and y from the middle of the input, z from the ground.
         """
         require(shape_m.shape == (COARSE_POINTS, 3), "start shape", shape_m.shape, f"({COARSE_POINTS}, 3)")
-        shape = torch.from_numpy(shape_m)
-        center = (shape.amax(0) + shape.amin(0)) / 2
-        self.coarse3.bias.copy_(((shape - center) / SCALE_M).flatten())
+        self.coarse3.bias.copy_((torch.from_numpy(shape_m) / SCALE_M).flatten())
         self.coarse3.weight.mul_(0.1)
 
     def forward(self, points_m: Tensor, counts: Sequence[int], cells: Tensor | None = None) -> Completion:
@@ -123,6 +122,7 @@ class CompletionNetwork(nn.Module):
         with torch.no_grad():
             clouds = torch.split(points_m, list(counts))
             center_m = torch.stack([(cloud.amax(0) + cloud.amin(0)) / 2 for cloud in clouds])
+            center_m[:, 2] = 0
             repeats = torch.tensor(counts, device=points_m.device)
             owner = torch.repeat_interleave(repeats, output_size=len(points_m))
         points = (points_m - center_m[owner]) / SCALE_M

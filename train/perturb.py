@@ -336,7 +336,9 @@ def _final_count(settings: PerturbSettings, rng: np.random.Generator) -> int:
     return limit
 
 
-def perturb(mesh: Mesh, settings: PerturbSettings, rng: np.random.Generator, sector: int | None = None) -> Float32:
+def perturb(
+    mesh: Mesh, settings: PerturbSettings, rng: np.random.Generator, sector: int | None = None
+) -> tuple[Float32, Float64]:
     """A partial, holed, noisy cloud of an object in the object's own frame.
 
     Args:
@@ -345,7 +347,8 @@ def perturb(mesh: Mesh, settings: PerturbSettings, rng: np.random.Generator, sec
         rng: source of chance; the same state gives the same cloud.
         sector: eighth of the circle the radar stands in, None = anywhere.
     Returns:
-        float32 [n, 3], n <= max_points, random order, no point repeated; n can be small, even 0, when little is seen.
+        Points float32 [n, 3], n <= max_points, random order, no point repeated (n can be small, even 0, when little is
+        seen), and the radar's mean position float64 [3] in the same frame.
     """
     view = draw_view(mesh, settings, rng, sector)
     points = base_sample(snapshot(mesh, view, settings), view, settings, rng)
@@ -360,4 +363,4 @@ def perturb(mesh: Mesh, settings: PerturbSettings, rng: np.random.Generator, sec
         points = add_artefacts(points, view, settings, rng)
     low, high = settings.clip_z_m
     points = points[(points[:, 2] > low) & (points[:, 2] < high)]
-    return points[rng.permutation(len(points))[: _final_count(settings, rng)]]
+    return points[rng.permutation(len(points))[: _final_count(settings, rng)]], view.middle

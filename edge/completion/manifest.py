@@ -11,12 +11,14 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from edge.errors import ModelError
 from edge.resources import shipped_dir
 
 SCHEMA = 1
+InputFrame = Literal["object", "line_of_sight"]
+INPUT_FRAMES: tuple[InputFrame, ...] = get_args(InputFrame)
 FILE_LIMIT_BYTES = 256 * 2**20
 """Larger files are refused before they are read."""
 
@@ -68,6 +70,7 @@ class Manifest:
         default_file: the one that is run.
         classes: names in the order of the network's probabilities.
         min_points, max_points: input sizes the network was trained on.
+        input_frame: frame of its input and output: the object's, or that of ``edge.completion.sight``.
         coarse_points, fine_points: sizes of the two output clouds.
         rigs: rigs whose clouds the training data are like.
         golden_file: file with the known answers.
@@ -80,6 +83,7 @@ class Manifest:
     classes: tuple[str, ...]
     min_points: int
     max_points: int
+    input_frame: InputFrame
     coarse_points: int
     fine_points: int
     rigs: tuple[str, ...]
@@ -137,6 +141,7 @@ def read_manifest(directory: Path) -> Manifest:
         classes=tuple(top["classes"]),
         min_points=sizes["min_points"],
         max_points=sizes["max_points"],
+        input_frame=sizes["frame"],
         coarse_points=output["coarse"],
         fine_points=output["fine"],
         rigs=tuple(top["rigs"]),
@@ -230,6 +235,7 @@ def _check(path: Path, manifest: Manifest) -> None:
             manifest.classes,
             "different names",
         ),
+        (manifest.input_frame in INPUT_FRAMES, "input.frame", manifest.input_frame, ", ".join(INPUT_FRAMES)),
         (min(sizes) > 0 and sizes[0] <= sizes[1], "input and output", sizes, "positive, min_points <= max_points"),
         (
             tolerances.keys() == manifest.files.keys()

@@ -16,6 +16,7 @@ import numpy as np
 import onnxruntime
 
 from edge.completion.manifest import Manifest, read_files, read_manifest
+from edge.completion.sight import bearing_rad, turned
 from edge.config import CompletionSettings
 from edge.errors import ConfigError, ModelError
 from edge.frames import Float32, ObjectCloud, Shape
@@ -104,20 +105,21 @@ class CompletionModel:
         More than ``max_points`` points are thinned at random, the same rows every time; nothing is padded or repeated.
 
         Args:
-            cloud: partial cloud in the object frame.
+            cloud: partial cloud in the object frame; a model of the line-of-sight frame also needs ``sensor_m``.
         Returns:
             The shape in the object frame, or None when the cloud has fewer than ``min_points`` points. Its confidence
             is that of ``confidence``; below ``min_confidence`` the class is "unknown".
         Raises:
-            ModelError: input or output is not finite; the shape is withheld.
+            ModelError: input or output is not finite, or there is no line of sight; the shape is withheld.
         """
         if len(cloud) < self.settings.min_points:
             return None
         started_ns = time.perf_counter_ns()
-        points = _thinned(np.ascontiguousarray(cloud.xyz_m, np.float32), self.settings.max_points)
-        if not np.isfinite(points).all():
+        if not np.isfinite(cloud.xyz_m).all():
             raise ModelError(f"object {cloud.identity}: its points are not finite, the shape is withheld")
-        fine, coarse, probability = self.run(points)
+        points = _thinned(np.ascontiguousarray(cloud.xyz_m, np.float32), self.settings.max_points)
+        bearing = self._bearing_rad(cloud)
+        fine, coarse, probability = self.run(turned(points, -bearing))
         if not (np.isfinite(fine).all() and np.isfinite(coarse).all() and np.isfinite(probability).all()):
             raise ModelError(
                 f"object {cloud.identity}: the network's answer is not finite, the shape is withheld",
@@ -132,8 +134,8 @@ class CompletionModel:
             class_name=self.manifest.classes[best] if trust >= self.settings.min_confidence else UNKNOWN,
             class_probability=probabilities,
             confidence=trust,
-            fine_m=fine,
-            coarse_m=coarse,
+            fine_m=turned(fine, bearing),
+            coarse_m=turned(coarse, bearing),
             input=cloud,
             model=self.identifier,
             latency_us={STAGE: (time.perf_counter_ns() - started_ns) // 1000},
@@ -143,7 +145,7 @@ class CompletionModel:
         """The bare network.
 
         Args:
-            points_m: float32 [n, 3].
+            points_m: float32 [n, 3] in the manifest's input frame.
         Returns:
             Fine points float32 [16384, 3], coarse points float32 [1024, 3], metres in the frame of the input, and class
             probabilities float32 [classes].
@@ -157,6 +159,12 @@ class CompletionModel:
                 f"model {self.manifest.name}: {self.file} failed ({type(error).__name__})", value=points_m.shape
             ) from error
         return fine, coarse, probability
+
+    def _bearing_rad(self, cloud: ObjectCloud) -> float:
+        """Angle of the network's input frame in the object frame."""
+        if self.manifest.input_frame == "object":
+            return 0.0
+        return bearing_rad(f"object {cloud.identity}", cloud.sensor_m, cloud.xyz_m)
 
     def _check_graph(self, path: Path) -> None:
         """Inputs and outputs by name, type and shape; a dimension the graph leaves open is any number."""

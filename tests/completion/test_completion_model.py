@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from edge.completion.model import CompletionModel, confidence
+from edge.completion.sight import turned
 from edge.config import CompletionSettings
 from edge.errors import ConfigError, ModelError
 from edge.frames import Float32, Float64, ObjectCloud, Pose
@@ -40,6 +41,15 @@ def golden() -> Float32:
 @pytest.fixture(scope="module")
 def model() -> CompletionModel:
     return CompletionModel.load(SHIPPED, SETTINGS)
+
+
+def framed(folder: Path, frame: str) -> CompletionModel:
+    """The shipped network, with a manifest that promises this input frame."""
+    shutil.copytree(SHIPPED, folder, dirs_exist_ok=True)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["input"]["frame"] = frame
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return CompletionModel.load(folder, SETTINGS, file="model.onnx")
 
 
 def resigned(folder: Path, file: str, content: bytes) -> Path:
@@ -70,10 +80,33 @@ def test_shape_of_the_known_input(model: CompletionModel, golden: Float32) -> No
 
 def test_the_shape_moves_with_its_input(model: CompletionModel, golden: Float32) -> None:
     shift = np.array([100.0, -40.0, 0.0], np.float32)
-    here, there = model.complete(cloud(golden)), model.complete(cloud(golden + shift))
+    here, there = model.complete(cloud(golden)), model.complete(cloud(golden + shift, sensor_m=SENSOR_M + shift))
     assert here is not None
     assert there is not None
     assert np.median(np.abs(there.coarse_m - shift - here.coarse_m)) < 0.01
+
+
+def test_the_network_sees_the_cloud_along_the_line_of_sight(tmp_path: Path, golden: Float32) -> None:
+    """Turning the scene, sensor and all, turns the shape; a network of the object frame gets the points as they are."""
+    model, plain = framed(tmp_path / "sight", "line_of_sight"), framed(tmp_path / "object", "object")
+    ahead = golden.mean(axis=0, dtype=np.float64) - [8.0, 0.0, 0.0]
+    reference = model.run(golden)[0]
+    for angle_rad in (0.0, 0.7, -2.5, np.pi):
+        sensor_m = turned(ahead[None], angle_rad)[0].astype(np.float64)
+        seen = model.complete(cloud(turned(golden, angle_rad), sensor_m=sensor_m))
+        assert seen is not None
+        np.testing.assert_allclose(seen.fine_m, turned(reference, angle_rad), atol=0.02)
+    unseen = plain.complete(cloud(golden, sensor_m=np.full(3, np.nan)))
+    assert unseen is not None
+    np.testing.assert_array_equal(unseen.fine_m, reference)
+
+
+def test_without_a_line_of_sight_the_shape_is_withheld(tmp_path: Path, golden: Float32) -> None:
+    model = framed(tmp_path, "line_of_sight")
+    above = golden.mean(axis=0, dtype=np.float64) + np.array([0.0, 0.0, 5.0])
+    for sensor_m, reason in ((np.array([np.nan, 0, 0]), "not known"), (above, "stands above")):
+        with pytest.raises(ModelError, match=f"object 7.*{reason}"):
+            model.complete(cloud(golden, sensor_m=sensor_m))
 
 
 def test_too_few_points_give_no_shape(model: CompletionModel, golden: Float32) -> None:
@@ -88,7 +121,7 @@ def test_too_many_points_are_thinned_and_never_repeated(model: CompletionModel, 
     model.run = lambda points_m: seen.append(points_m) or run(points_m)  # type: ignore[method-assign,func-returns-value]
     try:
         for points in (many, many, many[:2048], golden):
-            model.complete(cloud(points))
+            model.complete(cloud(points, sensor_m=points.mean(axis=0, dtype=np.float64) - [8.0, 0.0, 0.0]))
     finally:
         del model.run
     assert len(seen[0]) == len(np.unique(seen[0], axis=0)) == 2048

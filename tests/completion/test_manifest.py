@@ -61,6 +61,7 @@ def test_shipped_manifest_is_read() -> None:
         (lambda c: c["files"][0].update(file="../model.onnx"), "file name"),
         (lambda c: c["files"][0].update(sha256="0" * 63), "files.sha256"),
         (lambda c: c["files"][0].update(bytes=2**40), "files.bytes"),
+        (lambda c: c["input"].update(frame="odom"), "input.frame"),
         (lambda c: c["golden"]["tolerance_m"].pop("model.onnx"), "golden.tolerance_m"),
         (lambda c: c["golden"]["tolerance_m"].update({"model.onnx": float("nan")}), "golden.tolerance_m"),
     ],

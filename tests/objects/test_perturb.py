@@ -66,7 +66,7 @@ def test_distance_is_log_uniform(car: Mesh) -> None:
 
 def test_without_noise_and_holes_the_points_lie_on_the_surface(car: Mesh) -> None:
     surface = cKDTree(sample_surface(car.vertices, car.faces, 60_000, np.random.default_rng(2)))
-    points = perturb(car, CLEAN, np.random.default_rng(3))
+    points, _ = perturb(car, CLEAN, np.random.default_rng(3))
     assert 400 <= len(points) <= 1500
     assert surface.query(points)[0].max() < 0.06  # spacing of 60,000 points on 40 m^2
 
@@ -161,7 +161,7 @@ def test_order_decides_whether_rims_are_sharp(car: Mesh) -> None:
 
     assert min(emptiest(True)) >= 1
     assert np.mean(np.array(emptiest(False)) < 1) > 0.8
-    same = [perturb(car, replace(PLAIN, noise_first=order), np.random.default_rng(9)) for order in (True, False)]
+    same = [perturb(car, replace(PLAIN, noise_first=order), np.random.default_rng(9))[0] for order in (True, False)]
     assert same[0].shape != same[1].shape or not np.array_equal(same[0], same[1])
 
 
@@ -192,7 +192,7 @@ def test_artefacts_keep_the_range_of_streaks_and_the_points() -> None:
 def test_all_steps_stay_inside_the_limits_and_never_pad(car: Mesh) -> None:
     counts = []
     for seed in range(60):
-        points = perturb(car, PerturbSettings(), np.random.default_rng(seed))
+        points, _ = perturb(car, PerturbSettings(), np.random.default_rng(seed))
         counts.append(len(points))
         assert points.dtype == np.float32
         assert np.isfinite(points).all()
@@ -207,13 +207,21 @@ def test_clouds_resemble_those_of_the_radar_pipeline(car: Mesh) -> None:
     """Measured on fused clouds: 82 to 96 % of the points within 10 cm of the surface."""
     surface = cKDTree(sample_surface(car.vertices, car.faces, 60_000, np.random.default_rng(0)))
     near = [
-        np.mean(surface.query(perturb(car, PerturbSettings(), np.random.default_rng(s)))[0] < 0.1) for s in range(40)
+        np.mean(surface.query(perturb(car, PerturbSettings(), np.random.default_rng(s))[0])[0] < 0.1) for s in range(40)
     ]
     assert 0.75 < np.mean(near) < 0.97
 
 
+def test_the_radar_stands_where_the_view_was_drawn_and_sees_the_near_side(car: Mesh) -> None:
+    for seed in range(20):
+        points, radar_m = perturb(car, CLEAN, np.random.default_rng(seed))
+        np.testing.assert_array_equal(radar_m, draw_view(car, CLEAN, np.random.default_rng(seed)).middle)
+        away = -radar_m[:2] / np.linalg.norm(radar_m[:2])
+        assert (points[:, :2] @ away).mean() < (car.vertices[:, :2] @ away).mean()
+
+
 def test_same_seed_same_cloud(car: Mesh) -> None:
-    first, second, other = (perturb(car, PerturbSettings(), np.random.default_rng(s)) for s in (1, 1, 2))
+    first, second, other = (perturb(car, PerturbSettings(), np.random.default_rng(s))[0] for s in (1, 1, 2))
     np.testing.assert_array_equal(first, second)
     assert first.shape != other.shape or not np.array_equal(first, other)
 

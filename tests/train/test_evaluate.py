@@ -26,6 +26,7 @@ def test_retrieval_of_a_known_shape_finds_it(train: CompletionDataset) -> None:
         whole = Sample(sample.truth + np.float32([3, 0, 0]), sample.truth, sample.label, sample.object_id)
         shifted = bank.retrieve(whole)
         assert np.abs(np.sort(shifted[:, 2]) - np.sort(sample.truth[:, 2])).max() < 0.3
+        np.testing.assert_allclose(shifted[:, 2].min(), sample.truth[:, 2].min(), atol=0.1)  # heights are kept
         assert len(shifted) == 2048
 
 

@@ -33,7 +33,7 @@ def test_parameters_without_the_class_head(name: str, parameters: int) -> None:
 
 def written_out(network: CompletionNetwork, points_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The paper's figure, layer by layer for one cloud, every input of the folding concatenated for every point."""
-    center = (points_m.amax(0) + points_m.amin(0)) / 2
+    center = (points_m.amax(0) + points_m.amin(0)) / 2 * torch.tensor([1, 1, 0])
     points = (points_m - center) / SCALE_M
     first = network.point2(network.point1(points).relu())
     both = torch.cat([first, first.amax(0).expand_as(first)], 1)
@@ -107,14 +107,17 @@ def test_order_and_repetition_of_points_do_not_matter(network: CompletionNetwork
             torch.testing.assert_close(output.logits, reference.logits, atol=1e-5, rtol=0)
 
 
-def test_shift_of_the_input_shifts_the_output() -> None:
+def test_shift_in_the_plane_shifts_the_output_and_height_does_not() -> None:
+    """x and y are relative to the input, z is not: a cloud 1 m higher is another input."""
     torch.manual_seed(1)
     network = CompletionNetwork(WIDTHS["tiny"], 4).double()
-    points, shift = cloud(300).double(), torch.tensor([12.5, -40.0, 3.25], dtype=torch.float64)
+    points, shift = cloud(300).double(), torch.tensor([12.5, -40.0, 0.0], dtype=torch.float64)
     with torch.no_grad():
         here, there = network(points, [300]), network(points + shift, [300])
+        higher = network(points + torch.tensor([0, 0, 1]), [300])
     torch.testing.assert_close(there.fine, here.fine + shift, atol=1e-9, rtol=0)
     torch.testing.assert_close(there.coarse, here.coarse + shift, atol=1e-9, rtol=0)
+    assert (higher.coarse - here.coarse - torch.tensor([0, 0, 1])).abs().max() > 0.1
 
 
 def test_some_cells_are_a_subset_of_all(network: CompletionNetwork) -> None:
@@ -131,9 +134,8 @@ def test_start_shape_is_what_the_untrained_network_answers_nearly(network: Compl
     points = cloud(100)
     center = (points.amax(0) + points.amin(0)) / 2
     with torch.no_grad():
-        coarse = network(points, [100]).coarse[0] - center
-    middle = (shape.max(0) + shape.min(0)) / 2
-    error = (coarse.numpy() - (shape - middle)).astype(np.float64)
+        coarse = network(points, [100]).coarse[0] - center * torch.tensor([1, 1, 0])
+    error = (coarse.numpy() - shape).astype(np.float64)
     assert np.sqrt((error**2).mean()) < 0.1
     with pytest.raises(ConfigError, match="1024"):
         network.start_from(shape[:-1])
