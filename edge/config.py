@@ -66,7 +66,8 @@ class CfarSettings:
     Args:
         kind: cell averaging or ordered statistic.
         p_fa: designed false-alarm probability per cell, on exponentially distributed power.
-        guard_range, guard_angle: half widths of the guard box in bins.
+        guard_range, guard_angle: half widths of the guard box in bins; in angle it must cover the main lobe (defaults
+            for 86 elements with Hann taper on 256 bins), or a strong target counts as its own noise.
         train_range, train_angle: half widths of the training box in bins; the ring between them is the neighbourhood.
         os_quantile: rank of the ordered statistic as a share of the ring's cells.
         min_range_m: cells nearer are not tested (transmit leakage).
@@ -76,9 +77,9 @@ class CfarSettings:
     kind: CfarKind = "ca"
     p_fa: float = 1e-6
     guard_range: int = 2
-    guard_angle: int = 2
+    guard_angle: int = 6
     train_range: int = 8
-    train_angle: int = 8
+    train_angle: int = 14
     os_quantile: float = 0.75
     min_range_m: float = 0.6
     max_detections: int = 512

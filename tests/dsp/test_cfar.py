@@ -143,14 +143,14 @@ def test_a_peak_of_100_db_beside_does_not_touch_the_noise_estimate():
     detector = Detector(RADAR, settings("ca"))
     quiet = detector.noise(heatmap(power)).copy()
     beside = detector.noise(heatmap(strong))
-    inside = np.zeros_like(power, dtype=bool)
-    inside[92:109, 52:69] = True
-    inside[98:103, 58:63] = False
+    ring, inside = detector.settings, np.zeros_like(power, dtype=bool)
+    for value, a, r in ((True, ring.train_angle, ring.train_range), (False, ring.guard_angle, ring.guard_range)):
+        inside[100 - a : 101 + a, 60 - r : 61 + r] = value
     assert np.array_equal(beside[~inside], quiet[~inside])
     expected = np.array(
-        [definition.ring_values(power, a, r, detector.settings, 0).mean() for a, r in ((99, 61), (103, 70))]
+        [definition.ring_values(power, a, r, detector.settings, 0).mean() for a, r in ((99, 61), (107, 70))]
     )
-    measured = np.array([beside[99, 61], beside[103, 70]])
+    measured = np.array([beside[99, 61], beside[107, 70]])
     np.testing.assert_allclose(measured, expected, rtol=1e-5)
 
 

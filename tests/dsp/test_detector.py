@@ -79,6 +79,21 @@ def test_signal_to_noise_is_the_peak_over_the_ring():
     assert found.power_db[0] == pytest.approx(10 * np.log10(2000.0), abs=0.01)
 
 
+def test_a_strong_target_is_not_its_own_noise():
+    """SNR of a cascade's target: a^2 over the noise of a window's weights; a guard inside the lobe stops at 24 dB."""
+    radar, amplitude, noise_lsb = cascade_radar(), 10.0, 25.0
+    position = radar.array.position
+    taper = np.sin(np.pi * (np.arange(86) + 0.5) / 86) ** 2 / np.bincount(position[position >= 0])
+    weight = taper[position[position >= 0]]
+    noise = noise_lsb**2 * (1.5 / 256) * (weight**2).sum() / weight.sum() ** 2
+    imager, detector = Imager(radar, HeatmapSettings(), FLAT), Detector(radar, CfarSettings())
+    rng, measured = np.random.default_rng(9), []
+    for _ in range(10):
+        frame = make_frame(radar, [place(5.0, 10)], amplitude, 0, 0, noise_lsb=noise_lsb, rng=rng)
+        measured.append(detector.process(imager.process(frame)).snr_db[0])
+    assert np.mean(measured) == pytest.approx(10 * np.log10(amplitude**2 / noise), abs=0.5)
+
+
 @pytest.mark.parametrize("kind", ["ca", "os"])
 def test_silence_gives_no_detection(kind):
     found = Detector(RADAR, CfarSettings(kind=kind)).process(heatmap(np.zeros((64, 64))))
