@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edge.stream.client import connect
 
 __all__ = ["connect"]
+
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+"""ONNX Runtime would keep a device id and report to its maker; it reads this when it is imported."""
 
 
 def __getattr__(name: str) -> object:

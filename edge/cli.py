@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import io
 import json
 import os
 import sys
@@ -34,6 +35,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 ok, 1 failure, 2 usage, 3 degraded, 4 no hardware, 5 bad configuration, 6 bad model.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
+    try:
+        code = _dispatch(arguments)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        print(f"rfconstruct {arguments[0]}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        _silence_stdout()
+        return ExitCode.OK
+    except OSError as error:
+        _silence_stdout()
+        what = f"{error.filename or 'output'}: {error.strerror or error}"
+        print(f"rfconstruct {' '.join(arguments[:1])}: {what}", file=sys.stderr)
+        return ExitCode.FAILURE
+
+
+def _dispatch(arguments: Sequence[str]) -> int:
+    """Find the verb and run it."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(overview())
         return ExitCode.OK if arguments else ExitCode.USAGE
@@ -68,21 +91,22 @@ def _run(verb: str, rest: Sequence[str]) -> int:
         return int(module.run(args))
     except RfconstructError as error:
         return _report(verb, error, args.json)
-    except KeyboardInterrupt:
-        print(f"rfconstruct {verb}: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return ExitCode.OK
 
 
 def _report(verb: str, error: RfconstructError, as_json: bool) -> int:
     if as_json:
-        content = {"what": error.what, "value": error.value, "allowed": error.allowed, "action": error.action}
-        print(json.dumps({"error": content, "exit_code": int(error.exit_code)}, default=str))
+        value = None if error.value is None else str(error.value)
+        content = {"what": error.what, "value": value, "allowed": error.allowed, "action": error.action}
+        print(json.dumps({"error": content, "exit_code": int(error.exit_code)}))
     else:
         print(f"rfconstruct {verb}: {error}", file=sys.stderr)
     return int(error.exit_code)
+
+
+def _silence_stdout() -> None:
+    """Nobody reads stdout any more: the interpreter must not fail to flush it when it ends."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

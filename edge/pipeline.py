@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
+
 from edge.accounting import FrameLedger
 from edge.completion.model import CompletionModel
 from edge.dsp.checks import FrameRejected
@@ -42,6 +44,10 @@ from edge.timing import StageTimes
 
 MAX_WAITING_PAIRS = 64
 """Frame pairs that wait for a later pose before the oldest is given up: about a second at 60 frames/s."""
+FARTHEST_M = 1e8
+"""Positions beyond are no odometry, whatever its origin; arithmetic with them would overflow."""
+REFUSED_POSES = 30
+"""Poses refused in a row before the pose clock counts as restarted: one stamp of the far future must not end all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,16 +137,18 @@ class Pipeline:
         self._tracker = ObjectTracker(settings.objects, rig.geometry)
         self._waiting: deque[FramePair] = deque()
         self._newest_pose_ns: int | None = None
+        self._refused_in_a_row = 0
 
     def feed(self, item: RadarFrame | Pose | Loss) -> None:
         """Take the next frame, pose or loss of a source, in the source's order.
 
         Raises:
-            CaptureError: a radar that the rig does not have, or another layout than its schedule's.
+            CaptureError: a radar that the rig does not have, or another layout than its schedule's; nothing was taken.
         """
         if isinstance(item, Pose):
             self._add_pose(item)
         else:
+            self._check_layout(item)
             pairs, losses = self._pairer.add(item)
             self._note(losses)
             self._waiting.extend(pairs)
@@ -149,20 +157,36 @@ class Pipeline:
     def finish(self) -> None:
         """The source has ended: what still waits is processed or counted, the last window is closed."""
         self._note(self._pairer.flush())
-        self._work()
-        while self._waiting:
-            self._give_up(self._waiting.popleft())
+        self._work(last=True)
         self._close(self._fusion.flush())
         for ledger in self.ledgers.values():
             ledger.check()
 
+    def _check_layout(self, item: RadarFrame | Loss) -> None:
+        board = self.rig.radars.get(item.radar)
+        if isinstance(item, RadarFrame) and board is not None and item.layout != board.schedule.layout:
+            raise CaptureError(
+                f"{item.radar} frame {item.number} has another layout than the schedule of rig {self.rig.name}",
+                value=item.layout,
+                allowed=str(board.schedule.layout),
+                action="use the rig that the capture was made with",
+            )
+
     def _add_pose(self, pose: Pose) -> None:
+        """Refuse it, or restart the track after so many in a row that the clock or the sensor must have restarted."""
         try:
+            if np.abs(pose.position_m).max() > FARTHEST_M:
+                raise PoseError(f"pose at {pose.t_ns} ns", value=pose.position_m.tolist(), allowed=f"<= {FARTHEST_M} m")
             self._track.add(pose)
-            self._newest_pose_ns = pose.t_ns
+            self._newest_pose_ns, self._refused_in_a_row = pose.t_ns, 0
         except PoseError as error:
             self.faults.poses_refused += 1
             self.faults.last = str(error)
+            self._refused_in_a_row += 1
+            if self._refused_in_a_row >= REFUSED_POSES:
+                self._close(self._fusion.flush())
+                self._track.clear()
+                self._newest_pose_ns, self._refused_in_a_row = None, 0
 
     def _note(self, losses: Sequence[Loss]) -> None:
         """Remember the newest loss in words; the pairer has counted it."""
@@ -172,29 +196,34 @@ class Pipeline:
 
     def _give_up(self, pair: FramePair) -> None:
         """No pose for this pair."""
-        self._lose_pair(pair, LossCause.NO_POSE)
-        self.faults.last = f"frame {pair.number}: {self._track.why_none(pair.t_ns)}"
+        why = self._track.why_none(pair.t_ns) or "no other pose near enough to know the velocity"
+        self._lose_pair(pair, LossCause.NO_POSE, f"frame {pair.number}: {why}")
 
-    def _lose_pair(self, pair: FramePair, cause: LossCause) -> None:
+    def _lose_pair(self, pair: FramePair, cause: LossCause, why: str) -> None:
+        self.faults.last = why
         for radar in pair.frames:
             self.ledgers[radar].lost(cause)
 
-    def _work(self) -> None:
-        """Process every waiting pair whose pose is known."""
+    def _work(self, last: bool = False) -> None:
+        """Process every waiting pair whose pose and velocity are known, or known never to come.
+
+        One radar needs no pose, but uses it: while there are poses its frames wait for theirs, too.
+        """
         while self._waiting:
             pair = self._waiting[0]
-            pose = self._track.at(pair.t_ns)
-            if pose is None and self._associator is not None:
-                may_still_come = self._newest_pose_ns is None or pair.t_ns > self._newest_pose_ns
-                if may_still_come and len(self._waiting) <= MAX_WAITING_PAIRS:
+            pose, velocity_m_s = self._track.at(pair.t_ns), self._track.velocity_rig_m_s(pair.t_ns)
+            if velocity_m_s is None:
+                newest_ns = self._newest_pose_ns
+                due = self._associator is not None if newest_ns is None else pair.t_ns >= newest_ns
+                if due and not last and len(self._waiting) <= MAX_WAITING_PAIRS:
                     return
-                self._give_up(self._waiting.popleft())
-                continue
             self._waiting.popleft()
-            self._process(pair, pose)
+            if velocity_m_s is None and self._associator is not None:
+                self._give_up(pair)
+            else:
+                self._process(pair, pose, velocity_m_s)
 
-    def _process(self, pair: FramePair, pose: Pose | None) -> None:
-        velocity_m_s = self._track.velocity_rig_m_s(pair.t_ns)
+    def _process(self, pair: FramePair, pose: Pose | None, velocity_m_s: Float64 | None) -> None:
         heatmaps = self._image(pair, velocity_m_s)
         if len(heatmaps) < len(self.radars):
             return
@@ -202,21 +231,23 @@ class Pipeline:
         for radar, heatmap in heatmaps.items():
             with self.times.measure("detect"):
                 detections[radar] = self._detectors[radar].process(heatmap)
+        cause = LossCause.UNPAIRED
         try:
             cloud = self._associate(detections, velocity_m_s)
+            cause = LossCause.NOT_FINITE
+            fused = self._fuse(cloud, pose)
         except CaptureError as error:
-            self.faults.last = str(error)
-            self._lose_pair(pair, LossCause.UNPAIRED)
+            self._lose_pair(pair, cause, str(error))
+            return
+        except PoseError as error:
+            self._lose_pair(pair, LossCause.BACKWARDS_TIME, str(error))
             return
         for radar in pair.frames:
             self.ledgers[radar].ok()
         result = FrameResult(pair.number, pair.t_ns, heatmaps, detections, cloud, pose)
         for sink in self.sinks:
             sink.frame(result)
-        if cloud is not None and pose is not None:
-            with self.times.measure("fuse"):
-                fused = self._fusion.add(cloud, pose)
-            self._close(fused)
+        self._close(fused)
 
     def _image(self, pair: FramePair, velocity_m_s: Float64 | None) -> dict[RadarId, Heatmap]:
         """Heatmaps of all radars; when one frame is refused its partner is lost with it."""
@@ -241,6 +272,12 @@ class Pipeline:
             return None
         with self.times.measure("associate"):
             return self._associator.process(detections["horizontal"], detections["vertical"], velocity_m_s)
+
+    def _fuse(self, cloud: PointCloud | None, pose: Pose | None) -> FusedCloud | None:
+        if cloud is None or pose is None:
+            return None
+        with self.times.measure("fuse"):
+            return self._fusion.add(cloud, pose)
 
     def _close(self, cloud: FusedCloud | None) -> None:
         """Segment and complete a finished window."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from edge.frames import Pose, RadarFrame
@@ -13,7 +13,9 @@ from edge.pipeline import Pipeline
 from edge.sources.base import Loss
 
 LONGEST_SLEEP_S = 60.0
-"""A jump of the recorded clock beyond this is not waited for."""
+"""A jump of the recorded clock beyond this, either way, is not waited for."""
+LONGEST_NAP_S = 0.05
+"""Sleep is cut into naps of this length, so that a sign of life can be given in between."""
 
 
 class Pace:
@@ -21,11 +23,13 @@ class Pace:
 
     Args:
         speed: recorded seconds per second; 0 plays as fast as it goes.
+        idle: called again and again while it waits.
     """
 
-    def __init__(self, speed: float) -> None:
-        self._speed = speed
+    def __init__(self, speed: float, idle: Callable[[], None] | None = None) -> None:
+        self._speed, self._idle = speed, idle
         self._start: tuple[int, int] | None = None
+        self._last_ns = 0
         self.late_ns = 0
         """How long ago the last item was due."""
 
@@ -34,15 +38,15 @@ class Pace:
         if self._speed <= 0:
             return
         now_ns = time.monotonic_ns()
-        if self._start is None:
+        if self._start is None or abs(t_ns - self._last_ns) > LONGEST_SLEEP_S * self._speed * 1e9:
             self._start = (t_ns, now_ns)
+        self._last_ns = t_ns
         due_ns = self._start[1] + round((t_ns - self._start[0]) / self._speed)
-        ahead_s = (due_ns - now_ns) / 1e9
         self.late_ns = max(0, now_ns - due_ns)
-        if ahead_s > LONGEST_SLEEP_S:
-            self._start = (t_ns, now_ns)
-        elif ahead_s > 0:
-            time.sleep(ahead_s)
+        while (ahead_ns := due_ns - time.monotonic_ns()) > 0:
+            time.sleep(min(ahead_ns / 1e9, LONGEST_NAP_S))
+            if self._idle is not None:
+                self._idle()
 
 
 def play(
@@ -51,6 +55,7 @@ def play(
     speed: float,
     total: int | None = None,
     show_progress: bool = True,
+    idle: Callable[[], None] | None = None,
 ) -> None:
     """Feed everything a source has, then finish the pipeline.
 
@@ -58,22 +63,23 @@ def play(
         source: frames, poses and losses in time order.
         pipeline: where they go.
         speed: recorded seconds per second; 0 plays as fast as it goes.
-        total: radar frames the source will give, when it knows.
+        total: radar frames and losses the source will give, when it knows.
         show_progress: draw a bar when stderr is a terminal.
+        idle: called again and again while the next item is not due.
     """
-    pace = Pace(speed)
+    pace = Pace(speed, idle)
     with _progress(total, show_progress) as bar:
         for item in source:
             if not isinstance(item, Loss):
                 pace.wait(item.t_ns if isinstance(item, Pose) else item.t_first_chirp_ns)
             pipeline.feed(item)
-            if isinstance(item, RadarFrame):
-                bar.update(1)
+            if not isinstance(item, Pose):
+                bar.update(item.count if isinstance(item, Loss) else 1)
         pipeline.finish()
 
 
 def _progress(total: int | None, wanted: bool) -> Any:
     from tqdm import tqdm
 
-    hidden = not wanted or not sys.stderr.isatty()
+    hidden = not wanted or sys.stderr is None or not sys.stderr.isatty()
     return tqdm(total=total, unit="frame", desc="playing", disable=hidden, leave=False, dynamic_ncols=True)

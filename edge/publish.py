@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import resource
 import time
+from collections.abc import Callable
 
+from edge.errors import WireError
 from edge.pipeline import FrameResult, Pipeline, WindowResult
 from edge.stream.messages import LEVELS, RadarStatus, Reason, State, Status
 from edge.stream.publisher import Publisher
+from edge.stream.wire import STATUS_HZ
 
 
 class PublishingSink:
@@ -25,6 +28,9 @@ class PublishingSink:
         self._start_s = time.monotonic()
         self._reasons: dict[str, tuple[int, int, int]] = {}
         """Code -> count, first and last instant."""
+        self._unsent = 0
+        self._latency_us: dict[str, tuple[float, float, float]] = {}
+        self._latency_due_s = 0.0
 
     def watch(self, pipeline: Pipeline) -> None:
         """Take the status message's counters from this pipeline."""
@@ -34,22 +40,39 @@ class PublishingSink:
         """Publish one frame's results, and the sign of life when it is due."""
         publisher, found = self._publisher, result.detections
         for heatmap in result.heatmaps.values():
-            publisher.heatmap(heatmap)
-        publisher.detections(found.get("horizontal"), found.get("vertical"), result.cloud)
+            self._send(publisher.heatmap, heatmap)
+        self._send(publisher.detections, found.get("horizontal"), found.get("vertical"), result.cloud)
         if result.pose is not None:
-            publisher.pose(result.pose)
-        self.report("RUN")
+            self._send(publisher.pose, result.pose)
+        self.report()
 
     def window(self, result: WindowResult) -> None:
         """Publish a fused window and its shapes."""
-        self._publisher.cloud(result.cloud)
+        self._send(self._publisher.cloud, result.cloud)
         for shape in result.shapes:
-            self._publisher.shape(shape)
+            self._send(self._publisher.shape, shape)
 
-    def report(self, state: State) -> None:
+    def report(self, state: State = "RUN") -> None:
         """Heartbeat and status, as far as they are due."""
         self._publisher.heartbeat(state)
         self._publisher.status(self._status(state))
+
+    def _send(self, send: Callable[..., object], *content: object) -> None:
+        """Publish; what the wire format cannot express is counted."""
+        try:
+            send(*content)
+        except WireError as error:
+            self._unsent += 1
+            if self._pipeline is not None:
+                self._pipeline.faults.last = str(error)
+
+    def _latencies(self, pipeline: Pipeline) -> dict[str, tuple[float, float, float]]:
+        """Percentiles, not computed more often than they are published."""
+        now_s = time.monotonic()
+        if now_s >= self._latency_due_s:
+            self._latency_due_s = now_s + 1.0 / STATUS_HZ
+            self._latency_us = {s: (t.p50_us, t.p99_us, t.max_us) for s, t in pipeline.times.summary().items()}
+        return self._latency_us
 
     def _status(self, state: State) -> Status:
         pipeline = self._pipeline
@@ -71,7 +94,7 @@ class PublishingSink:
                 )
                 for radar, account in accounts.items()
             },
-            latency_us={s: (t.p50_us, t.p99_us, t.max_us) for s, t in pipeline.times.summary().items()},
+            latency_us=self._latencies(pipeline),
             system={"rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0},
             versions={"rfconstruct": self._version},
             uptime_s=uptime_s,
@@ -84,6 +107,7 @@ class PublishingSink:
             for cause, count in ledger.snapshot().lost.items():
                 counts[cause.name] = counts.get(cause.name, 0) + count
         counts["POSE_REFUSED"] = pipeline.faults.poses_refused
+        counts["NOT_SENT"] = self._unsent
         counts["SHAPE_WITHHELD"] = pipeline.faults.shapes_withheld
         counts["DEAD_CHANNEL"] = sum(map(len, pipeline.faults.dead_channels.values()))
         now_ns = time.monotonic_ns()

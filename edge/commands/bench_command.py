@@ -14,6 +14,7 @@ import numpy as np
 
 from edge.bench.measure import Timing, measure, processor
 from edge.bench.numpy_peer import NumpyImager, ca_decisions
+from edge.commands.arguments import seconds
 from edge.config import CfarSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
@@ -31,7 +32,7 @@ NOISE_LSB = 25.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("--rig", default="cascade_demo", help="rig with two radars (default: %(default)s, one loop)")
-    parser.add_argument("--seconds", type=float, default=12.0, help="time to spend measuring (default: %(default)s)")
+    parser.add_argument("--seconds", type=seconds, default=12.0, help="time to spend measuring (default: %(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:

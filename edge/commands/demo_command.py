@@ -46,12 +46,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _closing(run: session.Session, thing: DemoObject, elapsed_s: float) -> dict[str, Any]:
     """How near the best shape comes to the truth, and how near the radar points alone would have been."""
-    closing: dict[str, Any] = {"elapsed_s": round(elapsed_s, 1)}
+    closing: dict[str, Any] = {"elapsed_s": round(elapsed_s, 1), "simulated": True}
     if run.tally.shapes:
         best = max(run.tally.shapes.values(), key=lambda shape: shape.confidence)
         truth_m = thing.truth_odom_m()
-        closing["chamfer_distance_of_the_shape_cm_(simulated)"] = _distance_cm(best, best.fine_m, truth_m)
-        closing["chamfer_distance_of_the_radar_points_cm_(simulated)"] = _distance_cm(best, best.input.xyz_m, truth_m)
+        closing["shape_to_truth_chamfer_cm"] = _distance_cm(best, best.fine_m, truth_m)
+        closing["radar_points_to_truth_chamfer_cm"] = _distance_cm(best, best.input.xyz_m, truth_m)
     return closing
 
 

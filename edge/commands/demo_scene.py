@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
+import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -63,9 +63,12 @@ def demo_object() -> DemoObject:
 
 
 def cache_dir() -> Path:
-    """XDG_CACHE_HOME/rfconstruct, by default ~/.cache/rfconstruct."""
+    """XDG_CACHE_HOME/rfconstruct, by default ~/.cache/rfconstruct; CaptureError when there is no home."""
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "rfconstruct"
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "rfconstruct"
+    except RuntimeError as error:
+        raise CaptureError(f"no place for the demo's recording: {error}", action="set XDG_CACHE_HOME") from error
 
 
 def demo_recording(rig: Rig, thing: DemoObject, scene: DriveBy = SCENE) -> Path:
@@ -84,11 +87,11 @@ def demo_recording(rig: Rig, thing: DemoObject, scene: DriveBy = SCENE) -> Path:
         return path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for stale in path.parent.glob("demo-*.mcap*"):
+        for stale in path.parent.glob("demo-*.mcap"):
             stale.unlink(missing_ok=True)
-        partial = path.with_suffix(f".mcap.{os.getpid()}")
-        _record(partial, rig, thing, scene)
-        shutil.move(partial, path)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            _record(Path(folder) / path.name, rig, thing, scene)
+            (Path(folder) / path.name).replace(path)
     except OSError as error:
         raise CaptureError(
             f"the demo's recording cannot be written ({error.strerror})",

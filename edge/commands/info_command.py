@@ -12,7 +12,7 @@ from typing import Any
 
 from edge.completion.manifest import find_model, read_files, read_manifest
 from edge.constraints import format_table
-from edge.errors import ConfigError, ExitCode
+from edge.errors import ConfigError, ExitCode, ModelError
 from edge.recording.reader import RecordingReader
 from edge.rig import Rig, known_rigs, load_rig
 from edge.waveform import Schedule
@@ -27,11 +27,12 @@ def run(args: argparse.Namespace) -> int:
     """Find out what the target is and describe it."""
     path = Path(args.target)
     if path.is_file():
-        content = RecordingReader(path).info()
+        with RecordingReader(path) as reader:
+            content = reader.info()
         print(json.dumps(content, indent=2, default=str) if args.json else "\n".join(pairs(content)))
         return ExitCode.OK
-    if (path / "manifest.json").is_file() or (args.target not in known_rigs() and _is_model(args.target)):
-        content = describe_model(path if path.is_dir() else find_model(args.target))
+    if args.target not in known_rigs() and not (path / "rig.toml").is_file():
+        content = describe_model(_find_model(args.target))
         print(json.dumps(content, indent=2) if args.json else "\n".join(pairs(content)))
         return ExitCode.OK
     rig = load_rig(args.target)
@@ -39,11 +40,13 @@ def run(args: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
-def _is_model(name: str) -> bool:
+def _find_model(name: str) -> Path:
+    """Folder of the model; ConfigError when nothing at all has this name."""
     try:
-        return (find_model(name) / "manifest.json").is_file()
-    except (ConfigError, FileNotFoundError):
-        return False
+        return find_model(name)
+    except ModelError as error:
+        allowed = f"a recording, a rig ({', '.join(known_rigs())}) or a model ({error.allowed})"
+        raise ConfigError("nothing to describe has this name", value=name, allowed=allowed) from error
 
 
 def describe_model(folder: Path) -> dict[str, Any]:

@@ -9,7 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from edge.errors import ExitCode
+from edge.commands import arguments
+from edge.errors import ExitCode, RfconstructError
 from edge.stream.client import DEFAULT_ENDPOINT, Client, connect
 from edge.stream.convert import save_shape
 from edge.stream.messages import (
@@ -23,6 +24,7 @@ from edge.stream.messages import (
     StatusMessage,
 )
 
+TOPICS = ("shape", "cloud", "det", "pose", "heat", "status", "hb")
 DEFAULT_TOPICS = ("shape", "cloud", "status")
 
 
@@ -30,23 +32,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="address of the publisher (%(default)s)")
     parser.add_argument(
-        "--topic", action="append", help="shape, cloud, det, pose, heat, status, hb (default: shape, cloud, status)"
+        "--topic", action="append", type=topic, help=f"{', '.join(TOPICS)} (default: {', '.join(DEFAULT_TOPICS)})"
     )
     parser.add_argument("--save", type=Path, metavar="DIR", help="write every shape as PLY")
-    parser.add_argument("--count", type=int, help="end after so many messages")
-    parser.add_argument("--timeout", type=float, metavar="SECONDS", help="end after so long a silence")
+    parser.add_argument("--count", type=arguments.count, help="end after so many messages")
+    parser.add_argument("--timeout", type=arguments.seconds, metavar="SECONDS", help="end after so long a silence")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print until interrupted, until ``--count`` or until the silence of ``--timeout``; exit code 3 when that came."""
     if args.save is not None:
-        args.save.mkdir(parents=True, exist_ok=True)
+        _make_folder(args.save)
     with connect(args.endpoint, args.topic or DEFAULT_TOPICS, args.timeout) as client:
         try:
             seen = _print_messages(client, args)
         finally:
             _print_account(client)
     return ExitCode.OK if args.count is None or seen >= args.count else ExitCode.DEGRADED
+
+
+def topic(text: str) -> str:
+    """A topic, or one branch of it such as ``shape/car``; argparse.ArgumentTypeError when nothing is published so."""
+    if text.strip("/").split("/")[0] not in TOPICS:
+        raise argparse.ArgumentTypeError(f"got {text!r}; allowed: {', '.join(TOPICS)}")
+    return text
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RfconstructError(f"shapes cannot be saved ({error.strerror})", value=str(folder)) from error
 
 
 def _print_messages(client: Client, args: argparse.Namespace) -> int:

@@ -23,23 +23,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Open, play, report; exit code 3 when frames were lost."""
+    """Open, play, report; exit code 3 when frames were lost or the recording is cut or damaged."""
     path: Path = args.recording
-    if not path.exists():
-        raise RecordingError(f"{path}: no such recording", action="give an .mcap file or a capture folder")
     if path.is_dir():
         rig = rig_of(args)
         source, notes = open_capture(path, rig)
-        return _play(args, session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), source)
+        with closing(source):
+            return _play(session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), source)
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such recording", action="give an .mcap file or a capture folder")
     with RecordingReader(path) as reader:
         rig = calibrated(load_rig(args.rig) if args.rig else reader.read_rig(), args.calibration)
         notes = [f"{path}: its end is missing; played up to the last whole record"] if reader.truncated else []
-        return _play(args, session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), reader)
+        return _play(session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), reader)
 
 
-def _play(args: argparse.Namespace, run: session.Session, source: FrameSource) -> int:
-    with closing(source):
-        pictures = run.run(source, source.total_frames)
+def _play(run: session.Session, source: FrameSource) -> int:
+    pictures = run.run(source, source.total_frames)
+    damaged = isinstance(source, RecordingReader) and (source.truncated or source.report.bytes_lost > 0)
+    if isinstance(source, RecordingReader) and source.report.damaged_chunks:
+        run.notes.append(f"{source.path}: {source.report.damaged_chunks} damaged chunks were left out")
     run.report(pictures)
-    lost = sum(ledger.snapshot().frames_lost for ledger in run.pipeline.ledgers.values())
-    return ExitCode.DEGRADED if lost else ExitCode.OK
+    lost = any(ledger.snapshot().frames_lost for ledger in run.pipeline.ledgers.values())
+    return ExitCode.DEGRADED if lost or damaged else ExitCode.OK

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from edge.commands import arguments
 from edge.commands.report import Narrator, Tally, as_dict, lines
 from edge.completion.manifest import find_model
 from edge.completion.model import CompletionModel
@@ -30,29 +31,11 @@ from edge.warm import warm_up
 
 def add_arguments(parser: argparse.ArgumentParser, speed: str) -> None:
     """Options that both verbs have."""
-    parser.add_argument(
-        "--speed", default=speed, help="1 = as recorded, 2 = twice as fast, max = as fast as it goes (%(default)s)"
-    )
+    help_text = "1 = as recorded, 2 = twice as fast, max = as fast as it goes (%(default)s)"
+    parser.add_argument("--speed", type=arguments.speed, default=speed, help=help_text)
     parser.add_argument("--plot", type=Path, metavar="DIR", help="write pictures there (extra 'plot')")
     parser.add_argument("--endpoint", action="append", metavar="ADDRESS", help="publish there instead of the rig's")
     parser.add_argument("--no-publish", action="store_true", help="publish nothing")
-
-
-def parse_speed(text: str) -> float:
-    """``max`` is 0: no waiting.
-
-    Raises:
-        argparse.ArgumentTypeError: neither ``max`` nor a positive number.
-    """
-    if text == "max":
-        return 0.0
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = -1.0
-    if not 0.0 < speed < 1e6:
-        raise argparse.ArgumentTypeError(f"speed {text!r}: give a positive number, or max")
-    return speed
 
 
 def load_model(rig: Rig) -> tuple[CompletionModel | None, list[str]]:
@@ -89,22 +72,20 @@ class Session:
         truth_odom_m: Float32 | None = None,
     ) -> None:
         self.rig, self.tally, self.notes = rig, Tally(), list(notes)
-        self._args, self._speed = args, parse_speed(args.speed)
-        self._stack = ExitStack()
+        self._args, self._stack = args, ExitStack()
         model, more = load_model(rig)
         self.notes += more
         sinks: list[Sink] = [self.tally] if args.json else [self.tally, Narrator()]
-        self._publishing: PublishingSink | None = None
-        if not args.no_publish:
-            self._publishing = self._publisher(source_kind)
-            sinks.append(self._publishing)
         self._pictures: PictureCollector | None = None
         if args.plot is not None:
             self._pictures = PictureCollector(args.plot, title, truth_odom_m)
             sinks.append(self._pictures)
         self.pipeline = Pipeline(rig, model, sinks)
-        if self._publishing is not None:
+        self._publishing: PublishingSink | None = None
+        if not args.no_publish:
+            self._publishing = self._publisher(source_kind)
             self._publishing.watch(self.pipeline)
+            self.pipeline.sinks.append(self._publishing)
 
     def _publisher(self, kind: Source) -> PublishingSink:
         settings = self.rig.settings.stream
@@ -121,13 +102,15 @@ class Session:
 
     def run(self, source: Iterable[RadarFrame | Pose | Loss], total: int | None) -> list[Path]:
         """Play the source to its end; returns the pictures that were written."""
-        start_s = time.monotonic()
-        warm_up(self.rig)
-        self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+        publishing = self._publishing
+        idle = publishing.report if publishing is not None else None
         with self._stack:
-            play(source, self.pipeline, self._speed, total, show_progress=not self._args.json)
-            if self._publishing is not None:
-                self._publishing.report("STOP")
+            start_s = time.monotonic()
+            warm_up(self.rig)
+            self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+            play(source, self.pipeline, self._args.speed, total, not self._args.json, idle)
+            if publishing is not None:
+                publishing.report("STOP")
         return self._pictures.write() if self._pictures is not None else []
 
     def report(self, pictures: Sequence[Path], extra: dict[str, Any] | None = None) -> None:
@@ -138,4 +121,5 @@ class Session:
             return
         print("\n".join(lines(self.pipeline, self.tally, pictures, self.notes)))
         for key, value in (extra or {}).items():
-            print(f"{key.replace('_', ' ')}: {value}")
+            name, _, unit = key.rpartition("_")
+            print(f"{name.replace('_', ' ')}: {value} {unit}" if unit in ("s", "cm") else f"{key}: {value}")

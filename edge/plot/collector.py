@@ -11,6 +11,7 @@ from edge.frames import RADARS, Detections, Float32, FusedCloud, Heatmap, Pose, 
 from edge.odometry.transforms import rotation_matrix
 from edge.pipeline import FrameResult, WindowResult
 from edge.plot.clouds import cloud_picture
+from edge.plot.figure import prepare_folder
 from edge.plot.heatmaps import heatmap_picture
 from edge.plot.shapes import shape_picture
 
@@ -25,9 +26,13 @@ class PictureCollector:
         folder: where ``write`` puts the PNGs.
         subtitle: one line under every title, such as the recording's name.
         truth_odom_m: float32 [n, 3], surface of the true object in the odometry frame, for simulated scenes.
+    Raises:
+        DependencyError: matplotlib is not installed.
+        RfconstructError: the folder cannot be written.
     """
 
     def __init__(self, folder: Path, subtitle: str, truth_odom_m: Float32 | None = None) -> None:
+        prepare_folder(folder)
         self.folder, self.subtitle, self._truth_odom_m = folder, subtitle, truth_odom_m
         self._best: tuple[int, dict[RadarId, Heatmap], dict[RadarId, Detections]] | None = None
         self._frames: list[tuple[Pose, dict[RadarId, Detections]]] = []

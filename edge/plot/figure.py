@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 from pathlib import Path
 from typing import Any
 
-from edge.errors import DependencyError
+from edge.errors import DependencyError, RfconstructError
 
 INK, MUTED, GRID = "#1b1f24", "#6b7280", "#d9dde3"
 HORIZONTAL, VERTICAL, BOTH, INPUT, COARSE = "#1f6fb4", "#c8641b", "#1a7f5a", "#c0392b", "#7a4fb0"
@@ -24,16 +26,40 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str = ""
     Raises:
         DependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-    except ImportError as error:
-        raise DependencyError("pictures need matplotlib", action="pip install 'rfconstruct[plot]'") from error
+    require_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     below_head = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, 1.0 - HEAD_IN / height_in))
     figure = Figure(figsize=(width_in, height_in), layout=below_head, facecolor="white")
     figure.text(0.01, 1.0 - 0.24 / height_in, title, ha="left", va="center", fontsize=13, color=INK, fontweight="bold")
     figure.text(0.01, 1.0 - 0.48 / height_in, subtitle, ha="left", va="center", fontsize=9, color=MUTED)
     return figure
+
+
+def require_matplotlib() -> None:
+    """Raise DependencyError unless matplotlib is installed."""
+    try:
+        importlib.import_module("matplotlib.figure")
+    except ImportError as error:
+        raise DependencyError("pictures need matplotlib", action="pip install 'rfconstruct[plot]'") from error
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the folder of pictures, before the work whose pictures go there.
+
+    Raises:
+        DependencyError: matplotlib is not installed.
+        RfconstructError: the folder cannot be made or written.
+    """
+    require_matplotlib()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        writable = os.access(folder, os.W_OK | os.X_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        raise RfconstructError("pictures cannot be written", value=str(folder), allowed="a writable folder")
 
 
 def dress(axes: Any, title: str, x_label: str, y_label: str) -> None:
@@ -51,11 +77,10 @@ def dress(axes: Any, title: str, x_label: str, y_label: str) -> None:
 
 
 def write(figure: Any, path: Path) -> Path:
-    """Write a PNG; its folder is made when it is missing.
+    """Write a PNG.
 
     Returns:
         ``path``.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=DPI)
     return path
