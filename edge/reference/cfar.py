@@ -62,6 +62,19 @@ def decisions(
     return np.array(decided, dtype=np.bool_)
 
 
+def is_local_maximum(received: Float64, a: int, r: int) -> bool:
+    """Whether a cell holds the largest of its 3 x 3 neighbourhood; of equal ones the first in raster order does.
+
+    Args:
+        received: [angle, range], periodic in angle, power before the compensation of the antenna pattern.
+        a, r: the cell.
+    """
+    angles, ranges = received.shape
+    rows, columns = [(a + d) % angles for d in (-1, 0, 1)], [c for c in (r - 1, r, r + 1) if 0 <= c < ranges]
+    order = sorted((-received[row, c], row, c) for row in rows for c in columns)
+    return order[0][1:] == (a, r)
+
+
 def false_alarm_probability(kind: str, cells: int, rank: int, factor: float) -> float:
     """Probability that an exponential cell exceeds ``factor`` times the statistic of ``cells`` like it.
 

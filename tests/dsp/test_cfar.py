@@ -12,9 +12,10 @@ import pytest
 
 from edge.config import CfarSettings
 from edge.dsp.detector import Detector
+from edge.dsp.interpolation import PARABOLA
 from edge.dsp.threshold import cfar_scale, os_rank
 from edge.errors import ConfigError
-from edge.frames import Heatmap
+from edge.frames import Heatmap, PointResponse
 from edge.reference import cfar as definition
 
 RADAR = SimpleNamespace(radar="horizontal")
@@ -73,12 +74,29 @@ def test_false_alarm_rate_is_the_designed_one_inside_and_at_both_ends(kind, p_fa
     assert interior == pytest.approx(p_fa, rel=0.05)
 
 
-@pytest.mark.slow
+SPACED_ROWS = np.arange(0, 4095, 7)
+"""Angle rows whose rings, of half width 3, have no cell in common."""
+
+
 @pytest.mark.parametrize("kind", ["ca", "os"])
-def test_false_alarm_rate_at_one_in_ten_thousand(kind):
-    edge, interior = false_alarm_rates(kind, 1e-4, 25000, 32, 6)
-    assert edge == pytest.approx(1e-4, rel=0.05)
-    assert interior == pytest.approx(1e-4, rel=0.05)
+@pytest.mark.parametrize(
+    ("p_fa", "maps"), [(1e-2, 400), (1e-3, 4000), pytest.param(1e-4, 40000, marks=pytest.mark.slow)]
+)
+def test_false_alarms_of_cells_that_share_nothing_are_binomial(kind, p_fa, maps):
+    """Columns 0..2 from either end and two inside, rings disjoint: 4500 events and more, so 5 % are 3.4 sigma."""
+    rng = np.random.default_rng(17)
+    chosen = settings(kind, p_fa, guard_angle=1, train_angle=3, guard_range=1, train_range=3)
+    detector = Detector(RADAR, chosen)
+    edge, interior, power = 0, 0, np.empty((4095, 26), dtype=np.float32)
+    for n in range(maps):
+        rng.standard_exponential(out=power, dtype=np.float32)
+        decided = detector.decisions(heatmap(power))[SPACED_ROWS]
+        edge += int(decided[:, (n % 3, 25 - n % 3)].sum())
+        interior += int(decided[:, (9, 16)].sum())
+    cells = 2 * maps * len(SPACED_ROWS)
+    for events in (edge, interior):
+        assert events == pytest.approx(p_fa * cells, rel=0.05)
+        assert abs(events - p_fa * cells) < 3.4 * math.sqrt(p_fa * cells)
 
 
 def test_false_alarm_rate_holds_where_the_angle_axis_closes():
@@ -95,7 +113,12 @@ def test_false_alarm_rate_holds_where_the_angle_axis_closes():
 @pytest.mark.parametrize("kind", ["ca", "os"])
 @pytest.mark.parametrize(
     "shape",
-    [(2, 8, 2, 8), (1, 5, 3, 12), *(pytest.param(s, marks=pytest.mark.slow) for s in [(0, 1, 0, 1), (3, 4, 0, 2)])],
+    [
+        (6, 14, 2, 8),
+        (14, 24, 2, 8),
+        (1, 5, 3, 12),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in [(0, 1, 0, 1), (3, 4, 0, 2)]),
+    ],
 )
 def test_every_decision_is_that_of_brute_force(kind, shape):
     guard_angle, train_angle, guard_range, train_range = shape
@@ -123,6 +146,38 @@ def test_every_decision_is_that_of_brute_force(kind, shape):
     assert np.array_equal(decided[cells[:, 0], cells[:, 1]], expected)
     assert expected.any()
     assert not decided[:, :first].any()
+
+
+@pytest.mark.parametrize("kind", ["ca", "os"])
+def test_every_peak_is_that_of_brute_force(kind):
+    """Decisions on the compensated power, maxima of the received one; plateaus and both ends of either axis."""
+    rng = np.random.default_rng(12)
+    pattern = np.exp(-(np.linspace(-2, 2, 64) ** 2)).astype(np.float32)
+    received = rng.standard_exponential((64, 50)).astype(np.float32)
+    received[[0, 0, 63, 63, 30, 30, 31, 31], [0, 49, 20, 21, 30, 31, 30, 31]] = 40.0
+    received[[10, 11, 12], 15] = 30.0, 31.0, 30.5
+    response = PointResponse(PARABOLA, PARABOLA, 1.0 / pattern, 0.0, 0.0, 0.0)
+    map_ = dataclasses.replace(heatmap(received / pattern[:, None]), response=response)
+    detector = Detector(RADAR, settings(kind, 0.05))
+    found = detector.process(map_)
+    expected = [
+        50 * a + r
+        for a, r in np.argwhere(detector.decisions(map_)).tolist()
+        if definition.is_local_maximum((map_.power * detector._pattern[:, None]).astype(float), a, r)
+    ]
+    assert detector._cells[: len(found)].tolist() == expected
+    assert {50 * 11 + 15, 30 * 50 + 30} <= set(expected)
+
+
+@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("exponent", [-20, 20])
+def test_scaling_by_a_power_of_two_changes_nothing_at_all(kind, exponent):
+    """Floating-point products with 2^n are exact: here every decision must be the same."""
+    power = np.random.default_rng(1).standard_exponential((256, 64)).astype(np.float32)
+    detector = Detector(RADAR, settings(kind, 1e-2))
+    plain = detector.decisions(heatmap(power))
+    assert plain.any()
+    assert np.array_equal(detector.decisions(heatmap(power * np.float32(2.0**exponent))), plain)
 
 
 @pytest.mark.parametrize("kind", ["ca", "os"])

@@ -37,7 +37,7 @@ class Eye:
         self.detector = Detector(self.radar, rig.settings.cfar)
 
     def check(self, range_m, cosine):
-        """Range within 1 mm, direction within a tenth of a bin and, straight ahead, 0.02 degrees; level within 0.2 dB."""
+        """Range within 1 mm, direction within a tenth of a bin, ahead within 0.02 degrees; level within 0.2 dB."""
         angle_deg = np.degrees(np.arcsin(cosine))
         loss_db = 2.0 * self.antenna.along_loss_db * (angle_deg / self.antenna.along_edge_deg) ** 2
         amplitude_lsb = AMPLITUDE_LSB * 10 ** (-loss_db / 20)
