@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A few point scatterers beside a moving rig as raw frames and poses in time order, and a sink that keeps everything."""
+"""A few point scatterers beside a moving rig as raw frames and poses in time order; a sink that keeps everything."""
 
 from __future__ import annotations
 
