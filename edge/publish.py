@@ -52,6 +52,13 @@ class PublishingSink:
         for shape in result.shapes:
             self._send(self._publisher.shape, shape)
 
+    def invite(self, duration_s: float) -> None:
+        """Give signs of life until waiting subscribers have joined: what is published before that is lost for them."""
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s:
+            self.report("INIT")
+            time.sleep(0.02)
+
     def report(self, state: State = "RUN") -> None:
         """Heartbeat and status, as far as they are due."""
         self._publisher.heartbeat(state)

@@ -42,7 +42,7 @@ def _play(run: session.Session, source: FrameSource) -> int:
     pictures = run.run(source, source.total_frames)
     damaged = isinstance(source, RecordingReader) and (source.truncated or source.report.bytes_lost > 0)
     if isinstance(source, RecordingReader) and source.report.damaged_chunks:
-        run.notes.append(f"{source.path}: {source.report.damaged_chunks} damaged chunks were left out")
+        run.notes.append(f"{source.path}: damaged chunks left out: {source.report.damaged_chunks}")
     run.report(pictures)
     lost = any(ledger.snapshot().frames_lost for ledger in run.pipeline.ledgers.values())
     return ExitCode.DEGRADED if lost or damaged else ExitCode.OK

@@ -111,8 +111,7 @@ def _dead(pipeline: Pipeline) -> dict[str, tuple[str, ...]]:
 def _shape_line(shape: Shape) -> str:
     facts = shape_as_dict(shape)
     size = " x ".join(f"{side:.2f}" for side in facts["size_m"])
-    probability = shape.class_probability.get(shape.class_name, 0.0)
     return (
-        f"object {shape.identity}: {shape.class_name} (p {probability:.2f}, confidence {shape.confidence:.2f}), "
+        f"object {shape.identity}: {shape.class_name} (confidence {shape.confidence:.2f}), "
         f"{size} m, from {len(shape.input)} radar points of {shape.input.frames} frames"
     )

@@ -28,6 +28,9 @@ from edge.stream.wire import Source
 from edge.version import version
 from edge.warm import warm_up
 
+JOIN_S = 1.2
+"""Subscribers that wait for the address look for it every second at most."""
+
 
 def add_arguments(parser: argparse.ArgumentParser, speed: str) -> None:
     """Options that both verbs have."""
@@ -108,6 +111,8 @@ class Session:
             start_s = time.monotonic()
             warm_up(self.rig)
             self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+            if publishing is not None:
+                publishing.invite(JOIN_S)
             play(source, self.pipeline, self._args.speed, total, not self._args.json, idle)
             if publishing is not None:
                 publishing.report("STOP")

@@ -31,8 +31,7 @@ def shape_picture(path: Path, shape: Shape, subtitle: str, truth_m: Float32 | No
     ]
     if truth_m is not None:
         columns.append((f"truth ({len(truth_m)})", INK, truth_m, 0.7))
-    probability = shape.class_probability.get(shape.class_name, 0.0)
-    title = f"Object {shape.identity}: {shape.class_name} (p = {probability:.2f}, confidence {shape.confidence:.2f})"
+    title = f"Object {shape.identity}: {shape.class_name} (confidence {shape.confidence:.2f})"
     figure = new_figure(4.1 * len(columns), 7.6, title, subtitle)
     together = np.concatenate([points for _, _, points, _ in columns])
     low, high = together.min(axis=0), together.max(axis=0)

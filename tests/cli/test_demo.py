@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo from nothing but what is shipped: makes its recording once, pictures, and figures against the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from cli_run import rfconstruct
+
+from edge.commands import demo_scene
+from edge.errors import ExitCode
+
+
+def test_the_demo_runs_twice_and_makes_its_recording_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("RFCONSTRUCT_DATA", str(tmp_path))
+    first = rfconstruct("demo", "--speed", "max", "--no-publish", "--plot", tmp_path / "pictures")
+    assert first.code == ExitCode.OK
+    assert "parametric sedan" in first.out
+    assert "shape to truth chamfer" in first.out
+    names = sorted(picture.name for picture in (tmp_path / "pictures").iterdir())
+    assert names[:2] == ["fused_cloud.png", "heatmaps.png"]
+    assert names[2].startswith("shape_")
+    (cached,) = (tmp_path / "cache" / "rfconstruct").iterdir()
+    written_ns = cached.stat().st_mtime_ns
+
+    second = rfconstruct("demo", "--speed", "max", "--no-publish", "--json")
+    assert (second.code, second.err) == (ExitCode.OK, "")
+    content = second.json
+    assert cached.stat().st_mtime_ns == written_ns
+    assert content["simulated"] is True
+    assert 0 < content["shape_to_truth_chamfer_cm"] < 100
+    assert 0 < content["radar_points_to_truth_chamfer_cm"] < 200
+    assert content["frames"]["vertical"]["frames_ok"] == demo_scene.SCENE.frames
+    assert f"associated points: {content['points']};" in first.out
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("RFCONSTRUCT_DATA", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    outcome = rfconstruct("demo", "--no-publish")
+    assert outcome.code == ExitCode.FAILURE
+    assert "set XDG_CACHE_HOME" in outcome.err
