@@ -33,7 +33,10 @@ def tally() -> Tally:
 
 
 def test_the_recording_gives_what_its_frames_give(recording: Path, tally: Tally) -> None:
-    first, second = rfconstruct("replay", recording, "--json", *QUIET), rfconstruct("replay", recording, "--json", *QUIET)
+    first, second = (
+        rfconstruct("replay", recording, "--json", *QUIET),
+        rfconstruct("replay", recording, "--json", *QUIET),
+    )
     assert (first.code, first.err) == (ExitCode.OK, "")
     content = first.json
     assert content["detections"] == tally.detections
