@@ -37,7 +37,8 @@ def test_shipped_manifest_is_read() -> None:
     assert (manifest.min_points, manifest.max_points) == (64, 2048)
     assert (manifest.coarse_points, manifest.fine_points) == (1024, 16384)
     assert {"cascade_pair", "cascade_pair_fine", "cascade_demo"} <= set(manifest.rigs)
-    assert manifest.tolerance_m["model.onnx"] == 0.001
+    assert manifest.tolerance_m == CONTENT["golden"]["tolerance_m"]
+    assert manifest.input_frame == CONTENT["input"]["frame"]
     assert set(read_files(SHIPPED, manifest)) == {"model.onnx", "model.int8.onnx"}
 
 
