@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import importlib
 import io
 import json
 import os
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
 from edge.errors import ExitCode, RfconstructError
 from edge.version import version
@@ -82,7 +84,7 @@ def overview() -> str:
 
 
 def _run(verb: str, rest: Sequence[str]) -> int:
-    module = importlib.import_module(f"edge.commands.{verb}_command")
+    module = _command(verb)
     parser = argparse.ArgumentParser(prog=f"rfconstruct {verb}", description=f"{VERBS[verb]}.")
     module.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="machine-readable output on stdout")
@@ -91,6 +93,16 @@ def _run(verb: str, rest: Sequence[str]) -> int:
         return int(module.run(args))
     except RfconstructError as error:
         return _report(verb, error, args.json)
+
+
+def _command(verb: str) -> ModuleType:
+    """The verb's module; imported only now, since most verbs need few of the packages."""
+    try:
+        return importlib.import_module(f"edge.commands.{verb}_command")
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        raise OSError(errno.EROFS, "set NUMBA_CACHE_DIR to a writable folder", "cache of compiled kernels") from error
 
 
 def _report(verb: str, error: RfconstructError, as_json: bool) -> int:

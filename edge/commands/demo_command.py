@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     rig, thing = load_rig(RIG), demo_object()
     if not args.json:
         print(f"simulated: {SCENE.scatterers} point scatterers on {thing.credit}; rig {RIG}", flush=True)
-    path = demo_recording(rig, thing)
+    path = demo_recording(rig, thing, SCENE)
     if not args.json:
         print(f"recording: {path}, {SCENE.frames} frames of each radar", flush=True)
     run = session.Session(

@@ -71,7 +71,7 @@ def cache_dir() -> Path:
         raise CaptureError(f"no place for the demo's recording: {error}", action="set XDG_CACHE_HOME") from error
 
 
-def demo_recording(rig: Rig, thing: DemoObject, scene: DriveBy = SCENE) -> Path:
+def demo_recording(rig: Rig, thing: DemoObject, scene: DriveBy) -> Path:
     """Path of the demo's recording, made when it is not in the cache.
 
     Args:

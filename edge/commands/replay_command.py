@@ -43,6 +43,10 @@ def _play(run: session.Session, source: FrameSource) -> int:
     damaged = isinstance(source, RecordingReader) and (source.truncated or source.report.bytes_lost > 0)
     if isinstance(source, RecordingReader) and source.report.damaged_chunks:
         run.notes.append(f"{source.path}: damaged chunks left out: {source.report.damaged_chunks}")
+    accounts = [ledger.snapshot() for ledger in run.pipeline.ledgers.values()]
+    nothing = not any(account.frames_in for account in accounts)
+    if nothing:
+        run.notes.append("there was not a single radar frame")
     run.report(pictures)
-    lost = any(ledger.snapshot().frames_lost for ledger in run.pipeline.ledgers.values())
-    return ExitCode.DEGRADED if lost or damaged else ExitCode.OK
+    lost = any(account.frames_lost for account in accounts)
+    return ExitCode.DEGRADED if lost or damaged or nothing else ExitCode.OK

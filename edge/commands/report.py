@@ -8,12 +8,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from edge.best_shapes import keep_best
 from edge.frames import Shape
 from edge.pipeline import FrameResult, Pipeline, WindowResult
 
 
 class Tally:
-    """A sink that counts results and keeps the most trusted shape of every object."""
+    """A sink that counts results and keeps the most trusted shapes."""
 
     def __init__(self) -> None:
         self.detections: dict[str, int] = {}
@@ -30,9 +31,7 @@ class Tally:
         """Count a window, keep its shapes."""
         self.windows += 1
         for shape in result.shapes:
-            known = self.shapes.get(shape.identity)
-            if known is None or shape.confidence >= known.confidence:
-                self.shapes[shape.identity] = shape
+            keep_best(self.shapes, shape)
 
 
 class Narrator:
@@ -94,7 +93,7 @@ def lines(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: Seq
     for stage, time in pipeline.times.summary().items():
         text.append(f"{stage:<12}{time.count:>10}{time.p50_us / 1e3:>10.3f}{time.p99_us / 1e3:>10.3f}")
     found = ", ".join(f"{radar} {count}" for radar, count in tally.detections.items())
-    text += ["", f"detections: {found}; associated points: {tally.points}; windows: {tally.windows}"]
+    text += ["", f"detections: {found or 'none'}; associated points: {tally.points}; windows: {tally.windows}"]
     text += [_shape_line(shape) for _, shape in sorted(tally.shapes.items())]
     text += [f"dead channels of {radar}: {', '.join(names)}" for radar, names in _dead(pipeline).items()]
     if pipeline.faults.last:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edge.best_shapes import keep_best
 from edge.frames import RADARS, Detections, Float32, FusedCloud, Heatmap, Pose, RadarId, Shape
 from edge.odometry.transforms import rotation_matrix
 from edge.pipeline import FrameResult, WindowResult
@@ -55,9 +56,7 @@ class PictureCollector:
             self._window = (result.cloud, [entry for entry in inside if entry[0].t_ns <= result.cloud.t_end_ns])
         self._frames = inside
         for shape in result.shapes:
-            known = self._shapes.get(shape.identity)
-            if known is None or shape.confidence >= known.confidence:
-                self._shapes[shape.identity] = shape
+            keep_best(self._shapes, shape)
 
     def write(self) -> list[Path]:
         """Write all pictures that there is something for; returns their paths."""

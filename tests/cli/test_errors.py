@@ -148,6 +148,17 @@ def test_interrupts_and_full_disks(error: BaseException, code: int, told: str, m
     assert (outcome.code, outcome.out, outcome.err) == (code, "", told)
 
 
+def test_a_read_only_installation_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise RuntimeError("cannot cache function 'f': no locator available for file 'kernels.py'")
+
+    monkeypatch.setattr(cli.importlib, "import_module", fail)
+    monkeypatch.setattr(cli, "_silence_stdout", lambda: None)
+    outcome = rfconstruct("bench")
+    assert outcome.code == ExitCode.FAILURE
+    assert outcome.err == "rfconstruct bench: cache of compiled kernels: set NUMBA_CACHE_DIR to a writable folder\n"
+
+
 def test_pictures_without_matplotlib(places: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     outcome = rfconstruct("replay", places["rec"], "--no-publish", "--speed", "max", "--plot", places["tmp"])

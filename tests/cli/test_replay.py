@@ -11,7 +11,9 @@ from cli_run import RIG, SCENE, drive_by, rfconstruct, write_recording
 
 from edge.commands.report import Tally
 from edge.errors import ExitCode
+from edge.frames import Pose
 from edge.pipeline import Pipeline
+from edge.recording.writer import RecordingWriter
 from edge.stream.client import connect
 
 QUIET = ("--speed", "max", "--no-publish")
@@ -93,6 +95,17 @@ def test_pictures_and_a_waiting_subscriber(recording: Path, tmp_path: Path) -> N
         data = picture.read_bytes()
         assert data.startswith(b"\x89PNG\r\n\x1a\n")
         assert 20_000 < len(data) < 2_000_000
+
+
+def test_a_recording_without_frames_is_no_success(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "poses.mcap", RIG) as writer:
+        for item in drive_by():
+            if isinstance(item, Pose):
+                writer.pose(item)
+    outcome = rfconstruct("replay", tmp_path / "poses.mcap", *QUIET)
+    assert outcome.code == ExitCode.DEGRADED
+    assert "not a single radar frame" in outcome.out
+    assert "detections: none" in outcome.out
 
 
 def test_a_recording_of_another_rig_is_refused(recording: Path) -> None:

@@ -248,7 +248,7 @@ STEPS = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.lists(STEPS, max_size=40), st.booleans())
 def test_any_sequence_balances(steps: list[tuple[str, object, int, int]], one_radar: bool) -> None:
     radars: tuple[RadarId, ...] = ("horizontal",) if one_radar else RADARS

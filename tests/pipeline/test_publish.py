@@ -83,6 +83,7 @@ def play(publisher: Publisher, items: list[Item]) -> tuple[Pipeline, Keep, list[
     messages: list[Message] = received
     with joined(publisher) as client:
         thread = collect(client, messages)
+        sink.invite(0.25)
         for item in items:
             pipeline.feed(item)
         finish(pipeline, keep)
