@@ -12,7 +12,6 @@ from edge.commands import demo_command, demo_scene
 from edge.errors import ExitCode
 from edge.reference.drive_by import DriveBy
 
-
 SHORT = DriveBy(frames=30, frame_period_s=0.2, scatterers=300)
 """Half the frames over the same travel."""
 
