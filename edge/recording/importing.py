@@ -98,8 +98,9 @@ def import_capture(
     for radar, source in sources.items():
         report.frames_in[radar] = report.frames_ok[radar] = 0
         report.lost[radar] = Counter()
-        if isinstance(source, CaptureFolder):
+        if isinstance(source, CaptureFolder | LoopSum):
             report.notes += [f"{radar}: {note}" for note in source.notes]
+        if isinstance(source, CaptureFolder):
             report.notes += [f"{radar}: {name} is dead" for name in source.dead_channels()]
     writer = RecordingWriter(out_path, rig)
     try:

@@ -10,6 +10,7 @@ import re
 import socket
 import threading
 import time
+from pathlib import Path
 from types import TracebackType
 
 import zmq
@@ -228,7 +229,14 @@ def _pub_socket(context: zmq.Context[zmq.Socket[bytes]], high_water_mark: int) -
 
 
 def _bind(sender: zmq.Socket[bytes], endpoint: str) -> str:
-    """Bind and return the actual address; an address that someone else serves is refused, ipc included."""
+    """Bind and return the actual address; one that someone else serves, or a file that is no socket, is refused."""
+    path = Path(endpoint.removeprefix("ipc://"))
+    if endpoint.startswith("ipc:///") and path.exists() and not path.is_socket():
+        raise ConfigError(
+            "setting stream.endpoints: there is a file of this name, and it is no socket",
+            value=endpoint,
+            action="set another address: binding would delete the file",
+        )
     try:
         if endpoint.startswith("ipc://") and _is_served(endpoint.removeprefix("ipc://")):
             raise zmq.ZMQError(zmq.EADDRINUSE)

@@ -38,6 +38,7 @@ def test_import_and_replay_give_the_same(corridor: Path, tmp_path: Path) -> None
     imported = rfconstruct("import", corridor, "--rig", "corridor", "--calibration", calibration, "--out", recording)
     assert imported.code == ExitCode.OK
     assert "1 frames in the capture, 1 recorded" in imported.out
+    assert "note: horizontal: the loops were re-packed" in imported.out
     direct = rfconstruct("replay", corridor, "--rig", "corridor", "--calibration", calibration, "--json", *QUIET)
     recorded = rfconstruct("replay", recording, "--json", *QUIET)
     assert direct.json["detections"] == recorded.json["detections"]

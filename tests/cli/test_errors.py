@@ -49,6 +49,7 @@ REFUSED = [
     (("replay", "{rec}", "--endpoint", "nonsense"), 5, "tcp://127.0.0.1:PORT"),
     (("replay", "{rec}", "--endpoint", "tcp://0.0.0.0:5600"), 5, "not encrypted"),
     (("replay", "{rec}", "--endpoint", "ipc://{tmp}/no/folder"), 5, "cannot be bound"),
+    (("replay", "{rec}", "--endpoint", "ipc://{tmp}/text.mcap"), 5, "would delete the file"),
     (("replay", "{rec}", "--endpoint", "tcp://127.0.0.1:{port}"), 5, "stop the other publisher"),
     (("replay", "{rec}", "--no-publish", "--plot", "{tmp}/text.mcap"), 1, "writable folder"),
     (("replay", "{rec}", "--no-publish", "--plot", "/proc/pictures"), 1, "writable folder"),
