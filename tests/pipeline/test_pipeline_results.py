@@ -112,8 +112,8 @@ def test_a_stronger_scene_gives_the_same_places(kept: Keep) -> None:
     """Twice the signal and twice the noise: 6 dB more everywhere, nothing else."""
     assert NOISE_LSB > 10  # rounding of the ADC does not count
     frames = frames_of(3)
-    doubled = [replace(f, adc=(2 * f.adc).astype(np.int16)) for both in frames.values() for f in both]
-    _, keep = run(in_time_order(scene_poses(3), sorted(doubled, key=lambda f: f.t_first_chirp_ns)))
+    doubled = {radar: [replace(f, adc=(2 * f.adc).astype(np.int16)) for f in frames[radar]] for radar in frames}
+    _, keep = run(in_time_order(scene_poses(3), *doubled.values()))
     for once, twice in zip(kept.frames[:2], keep.frames[:2], strict=True):
         for radar, found in once.detections.items():
             np.testing.assert_allclose(twice.detections[radar].range_m, found.range_m, rtol=1e-5)

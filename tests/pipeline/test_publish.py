@@ -31,6 +31,7 @@ from edge.stream.messages import (
     StatusMessage,
 )
 from edge.stream.publisher import Publisher
+from edge.timing import StageTime
 
 FRAMES = 6
 POINTS_M = np.random.default_rng(3).normal(0.0, 1.0, (16384, 3)).astype(np.float32)
@@ -76,11 +77,11 @@ def collect(client: Client, into: list[Message]) -> threading.Thread:
 
 def play(publisher: Publisher, items: list[Item]) -> tuple[Pipeline, Keep, list[Message]]:
     objects = replace(RIG.settings.objects, min_points=3, core_points=2)
-    rig, keep, received = replace(RIG, settings=replace(RIG.settings, objects=objects)), Keep(), []
+    rig, keep = replace(RIG, settings=replace(RIG.settings, objects=objects)), Keep()
     sink = PublishingSink(publisher, "1.2.3")
     pipeline = Pipeline(rig, Complete(), [keep, sink])  # type: ignore[arg-type]
     sink.watch(pipeline)
-    messages: list[Message] = received
+    messages: list[Message] = []
     with joined(publisher) as client:
         thread = collect(client, messages)
         sink.invite(0.25)
@@ -156,7 +157,12 @@ def test_percentiles_are_not_computed_for_every_frame(publisher: Publisher, monk
     pipeline, sink = Pipeline(RIG, None), PublishingSink(publisher, "1")
     sink.watch(pipeline)
     calls: list[int] = []
-    monkeypatch.setattr(pipeline.times, "summary", lambda: calls.append(1) or {})
+
+    def summary() -> dict[str, StageTime]:
+        calls.append(1)
+        return {}
+
+    monkeypatch.setattr(pipeline.times, "summary", summary)
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
     for _ in range(50):
         sink.report()
