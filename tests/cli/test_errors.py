@@ -154,7 +154,7 @@ def test_a_read_only_installation_without_a_home(monkeypatch: pytest.MonkeyPatch
     def fail(name: str) -> None:
         raise RuntimeError("cannot cache function 'f': no locator available for file 'kernels.py'")
 
-    monkeypatch.setattr(cli.importlib, "import_module", fail)
+    monkeypatch.setattr("importlib.import_module", fail)
     monkeypatch.setattr(cli, "_silence_stdout", lambda: None)
     outcome = rfconstruct("bench")
     assert outcome.code == ExitCode.FAILURE

@@ -177,6 +177,24 @@ def test_one_pose_from_the_far_future_does_not_end_everything() -> None:
     assert account.frames_ok >= 15
 
 
+def test_after_all_clocks_restart_results_come_again() -> None:
+    """Frames and poses start again at an earlier time: once the pose track has restarted, all goes on as before."""
+    count, objects = REFUSED_POSES + 20, replace(RIG.settings.objects, min_points=3, core_points=2)
+    rig = replace(RIG, settings=replace(RIG.settings, objects=objects))
+    frames = [frame(radar, n) for n in range(count) for radar in RADARS]
+    numbered = [replace(f, number=f.number + count) for f in frames]
+    pipeline, keep = run([
+        *in_time_order([pose for pose in scene_poses(count, PERIOD_NS) if pose.t_ns > T0_NS - 10**7], frames),
+        *in_time_order(scene_poses(count, PERIOD_NS), numbered),
+    ], Pipeline(rig, None))  # fmt: skip
+    before, after = (window.cloud for window in keep.windows)
+    assert after.t_start_ns < before.t_end_ns
+    assert keep.frames[-1].number == 2 * count - 1
+    assert sum(len(window.objects) for window in keep.windows) > 0
+    assert set(lost(pipeline)["horizontal"]) <= {"backwards_time", "no_pose"}
+    assert len(keep.frames) >= count + 15
+
+
 def test_a_pose_that_stands_alone_gives_no_velocity_and_so_no_frame() -> None:
     alone = [pose_at(T0_NS + n * GAP_FRAMES * PERIOD_NS) for n in range(2)]
     frames = [frame(radar, n) for n in range(GAP_FRAMES + 1) for radar in RADARS]
