@@ -12,7 +12,7 @@ from edge.reference.chamfer import chamfer_l1_m, nearest_distance_m
 
 def test_a_shifted_lattice_is_as_far_as_the_shift() -> None:
     lattice = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3)
-    assert chamfer_l1_m(lattice, lattice + [0.1, 0.0, 0.0]) == pytest.approx(0.1, abs=1e-7)
+    assert chamfer_l1_m(lattice, lattice + np.array([0.1, 0.0, 0.0])) == pytest.approx(0.1, abs=1e-7)
 
 
 def test_it_is_the_mean_of_both_directions() -> None:

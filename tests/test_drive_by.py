@@ -35,7 +35,7 @@ def test_samples_lie_on_the_surface_and_spread_by_area() -> None:
 
 def test_the_object_stands_beside_the_middle_of_the_track() -> None:
     settings = DriveBy(frames=61, frame_period_s=0.1, speed_m_s=0.5, lateral_m=3.0)
-    placed = place(SQUARE + [0.0, 0.0, 7.0], settings, yaw_deg=90.0)
+    placed = place(SQUARE + np.array([0.0, 0.0, 7.0]), settings, yaw_deg=90.0)
     assert placed.min(axis=0) == pytest.approx([1.5, 3.0, 0.0])
     assert placed.max(axis=0) == pytest.approx([1.5, 5.0, 1.0])
 
