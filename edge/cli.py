@@ -22,7 +22,9 @@ VERBS = {
     "replay": "play a recording through the whole pipeline and publish what comes out",
     "listen": "print what a running pipeline publishes",
     "import": "turn a TI capture into a recording, or a TI calibration into ours",
+    "calibrate": "make a calibration from a corner-reflector capture; align two boards from several stops of it",
     "info": "describe a recording, a rig or a model; rigs with every hardware rule",
+    "doctor": "check this machine; --warm compiles the kernels before the first start",
     "bench": "time every stage beside a named peer in the same process",
 }
 INTERRUPTED = 130
@@ -77,7 +79,7 @@ def _dispatch(arguments: Sequence[str]) -> int:
 def overview() -> str:
     """Help that fits a screen."""
     lines = ["usage: rfconstruct COMMAND [options]", "", "commands:"]
-    lines += [f"  {verb:<8} {text}" for verb, text in VERBS.items()]
+    lines += [f"  {verb:<9} {text}" for verb, text in VERBS.items()]
     lines += ["", "rfconstruct COMMAND --help shows the options of one command."]
     lines += ["exit codes: 0 ok, 1 failure, 2 usage, 3 degraded, 4 no hardware, 5 bad configuration, 6 bad model"]
     return "\n".join(lines)

@@ -154,6 +154,15 @@ class Pipeline:
             self._waiting.extend(pairs)
         self._work()
 
+    def rehearse(self, frames: Mapping[RadarId, RadarFrame]) -> None:
+        """Image and detect frames that count nowhere; the first real one then finds every table and buffer.
+
+        Args:
+            frames: radar id -> any frame of its schedule's layout, noise for example.
+        """
+        for radar, frame in frames.items():
+            self._detectors[radar].process(self._imagers[radar].process(frame))
+
     def finish(self) -> None:
         """The source has ended: what still waits is processed or counted, the last window is closed."""
         self._note(self._pairer.flush())

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.frames import Pose, RadarFrame
+from edge.frames import Pose, RadarFrame, RadarId
 from edge.pipeline import Pipeline
 from edge.rig import Rig
 
@@ -18,11 +18,12 @@ P_FA = 0.05
 """Enough false alarms to have detections, pairs and points."""
 
 
-def warm_up(rig: Rig) -> dict[str, float]:
-    """Run a few frames of noise through a pipeline of their own.
+def warm_up(rig: Rig, pipeline: Pipeline | None = None) -> dict[str, float]:
+    """Run a few frames of noise through a pipeline of their own, then rehearse the one that will be used.
 
     Args:
         rig: its settings decide which kernels are compiled.
+        pipeline: of the rig; its tables are made. None: only the kernels are compiled.
     Returns:
         Stage -> longest time in milliseconds; seconds when a kernel was compiled, a few milliseconds from the cache.
     """
@@ -31,14 +32,25 @@ def warm_up(rig: Rig) -> dict[str, float]:
         cfar=replace(rig.settings.cfar, p_fa=P_FA),
         objects=replace(rig.settings.objects, core_points=1, min_points=1),
     )
-    pipeline = Pipeline(replace(rig, settings=settings), None)
-    rng = np.random.default_rng(0)
+    own = Pipeline(replace(rig, settings=settings), None)
+    frames: dict[RadarId, RadarFrame] = {}
     for number in range(FRAMES):
         t_ns = (number + 1) * round(1e9 * max(r.schedule.frame_period_s for r in rig.radars.values()))
-        pipeline.feed(Pose(t_ns, np.array([0.01 * number, 0.0, rig.geometry.height_m]), np.array([0.0, 0.0, 0.0, 1.0])))
-        for radar, board in rig.radars.items():
-            layout = board.schedule.layout
-            adc = rng.integers(-CODES, CODES, layout.shape, dtype=np.int16)
-            pipeline.feed(RadarFrame(radar, number, t_ns, adc, layout))
-    pipeline.finish()
-    return {stage: time.max_us / 1e3 for stage, time in pipeline.times.summary().items()}
+        own.feed(Pose(t_ns, np.array([0.01 * number, 0.0, rig.geometry.height_m]), np.array([0.0, 0.0, 0.0, 1.0])))
+        frames = noise_frames(rig, number, t_ns)
+        for frame in frames.values():
+            own.feed(frame)
+    own.finish()
+    if pipeline is not None:
+        pipeline.rehearse(frames)
+    return {stage: time.max_us / 1e3 for stage, time in own.times.summary().items()}
+
+
+def noise_frames(rig: Rig, number: int, t_ns: int) -> dict[RadarId, RadarFrame]:
+    """One frame of uniform noise for every radar of the rig, the same for the same number."""
+    rng = np.random.default_rng(number)
+    layouts = {radar: board.schedule.layout for radar, board in rig.radars.items()}
+    return {
+        radar: RadarFrame(radar, number, t_ns, rng.integers(-CODES, CODES, layout.shape, dtype=np.int16), layout)
+        for radar, layout in layouts.items()
+    }

@@ -109,7 +109,7 @@ class Session:
         idle = publishing.report if publishing is not None else None
         with self._stack:
             start_s = time.monotonic()
-            warm_up(self.rig)
+            warm_up(self.rig, self.pipeline)
             self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
             if publishing is not None:
                 publishing.invite(JOIN_S)
