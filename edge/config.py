@@ -15,9 +15,11 @@ from edge.errors import ConfigError
 WindowName = Literal["rectangular", "hann"]
 CfarKind = Literal["ca", "os"]
 PointEncoding = Literal["f4", "f2", "i2"]
+AssociationRule = Literal["optimal", "paper"]
 WINDOWS: tuple[WindowName, ...] = ("rectangular", "hann")
 CFAR_KINDS: tuple[CfarKind, ...] = ("ca", "os")
 POINT_ENCODINGS: tuple[PointEncoding, ...] = ("f4", "f2", "i2")
+ASSOCIATION_RULES: tuple[AssociationRule, ...] = ("optimal", "paper")
 
 
 def require(condition: bool, key: str, value: object, allowed: str, action: str = "") -> None:
@@ -122,20 +124,30 @@ class AssociationSettings:
     """Pairing of both radars' detections and the region that is kept.
 
     Args:
-        max_discrepancy_db: unequal counts: pair strongest first and stop beyond this (paper: 3 dB).
-        range_gate_bins: largest difference of the two corrected ranges, in range bins, to count as the same bin.
+        rule: "optimal", one-to-one assignment by range and level, or the paper's, by power rank inside a range bin.
+        range_gate_bins: largest difference of the two corrected ranges of a pair, in range bins.
+        level_scale_db: rule "optimal": scale of the logistic distribution of a pair's level difference; 4.34 when both
+            boards see a reflector fade independently (Swerling I), less when they partly agree.
+        max_discrepancy_db: rule "paper": unequal counts: pair strongest first and stop beyond this (paper: 3 dB).
+        sidelobe_db: detections weaker by more than another one of the radar at the same range are its sidelobes.
         fov_deg: largest angle off boresight along each array (paper: 45).
         max_height_m: points higher above the ground are removed (paper: 3).
         ground_margin_m: points lower than this above the ground are removed; negative keeps some below.
     """
 
-    max_discrepancy_db: float = 3.0
+    rule: AssociationRule = "optimal"
     range_gate_bins: float = 0.5
+    level_scale_db: float = 3.0
+    max_discrepancy_db: float = 3.0
+    sidelobe_db: float = 25.0
     fov_deg: float = 45.0
     max_height_m: float = 3.0
     ground_margin_m: float = 0.0
 
     def __post_init__(self) -> None:
+        require(self.rule in ASSOCIATION_RULES, "association.rule", self.rule, ", ".join(ASSOCIATION_RULES))
+        require(self.level_scale_db > 0, "association.level_scale_db", self.level_scale_db, "> 0")
+        require(self.sidelobe_db > 0, "association.sidelobe_db", self.sidelobe_db, "> 0")
         require(self.max_discrepancy_db > 0, "association.max_discrepancy_db", self.max_discrepancy_db, "> 0")
         require(self.range_gate_bins > 0, "association.range_gate_bins", self.range_gate_bins, "> 0")
         require(0 < self.fov_deg < 90, "association.fov_deg", self.fov_deg, "between 0 and 90")

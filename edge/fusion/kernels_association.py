@@ -14,7 +14,7 @@ from numba import boolean, float32, float64, int64, njit, types
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
-INVALID, FOV, BINS, UNMATCHED, POWER, PAIRS, GEOMETRY, GROUND, HEIGHT, POINTS = range(10)
+INVALID, FOV, SIDELOBE, BINS, UNMATCHED, POWER, PAIRS, GEOMETRY, GROUND, HEIGHT, POINTS = range(11)
 """Places in ``counts``."""
 
 COLUMNS = types.UniTuple(float32[::1], 3)  # type: ignore[no-untyped-call]
@@ -28,20 +28,33 @@ def _loss_db(cosine, pattern):  # type: ignore[no-untyped-def]
     return min(pattern[1] * (angle_deg / pattern[0]) ** 2, pattern[2])
 
 
-@njit(int64(COLUMNS, REAL, REAL, float64, int64, WHOLE, REAL, REAL, WHOLE), **OPTIONS)
-def describe(columns, board, pattern, sine_fov, start, source, common, level, counts):  # type: ignore[no-untyped-def]
-    """One radar's detections: keep those in the field of view and give what can be compared with the other radar.
+@njit(inline="always")
+def _is_sidelobe(n, range_m, power_db, sidelobe):  # type: ignore[no-untyped-def]
+    """Whether some detection at the same range is stronger by more than sidelobe[0] dB; the same: sidelobe[1] m."""
+    r, enough_db = float64(range_m[n]), float64(power_db[n]) + sidelobe[0]
+    for m in range(len(range_m)):
+        if enough_db < power_db[m] < np.inf and abs(float64(range_m[m]) - r) <= sidelobe[1]:
+            return True
+    return False
+
+
+@njit(int64(COLUMNS, REAL, REAL, float64, REAL, int64, WHOLE, REAL, REAL, WHOLE), **OPTIONS)
+def describe(  # type: ignore[no-untyped-def]
+    columns, board, pattern, sine_fov, sidelobe, start, source, common, level, counts
+):
+    """One radar's detections: keep the main lobes in the field of view and give what both radars can compare.
 
     Args:
         columns: range m, direction cosine, power dB of the radar, float32 [n] each.
         board: [3], phase centre from the common origin, forward and along the array, m; power offset, dB.
         pattern: [3], loss across an array: edge in degrees, one-way loss there in dB, most in dB.
         sine_fov: largest |cosine|.
+        sidelobe: [2], a detection this many dB weaker than another one within so many m of range is its sidelobe.
         start: first place to fill.
         source: receives the index in the columns.
         common: receives the range from the common origin.
         level: receives the power less the loss that the other radar has at this cosine: equal in both for one target.
-        counts: INVALID and FOV are increased.
+        counts: INVALID, FOV and SIDELOBE are increased.
     Returns:
         One past the last place filled.
     """
@@ -54,6 +67,9 @@ def describe(columns, board, pattern, sine_fov, start, source, common, level, co
             continue
         if abs(c) > sine_fov:
             counts[FOV] += 1
+            continue
+        if _is_sidelobe(n, range_m, power_db, sidelobe):
+            counts[SIDELOBE] += 1
             continue
         ahead = board[0] * np.sqrt(1.0 - c * c) + board[1] * c
         common[place] = np.sqrt(max(r * r + 2.0 * r * ahead + board[0] ** 2 + board[1] ** 2, 0.0))
@@ -246,6 +262,28 @@ def _locate(r_h, u, r_v, w, board):  # type: ignore[no-untyped-def]
     return square_h >= 0.0 and square_v >= 0.0, x, y, z
 
 
+@njit(inline="always")
+def judge(r_h, u, r_v, w, board, up, limits):  # type: ignore[no-untyped-def]
+    """Why a pair is no point of the kept region (GEOMETRY, GROUND or HEIGHT; -1: it is one), and its x, y, z.
+
+    Args:
+        r_h, u, r_v, w: ranges and direction cosines of the horizontal and of the vertical radar.
+        board: [2, 3], phase centres in the rig frame of the reference instant.
+        up: [4], unit vector up in the rig frame, height of the rig origin.
+        limits: [2], lowest and largest height above ground.
+    """
+    seen, x, y, z = _locate(r_h, u, r_v, w, board)
+    height = up[0] * x + up[1] * y + up[2] * z + up[3]
+    verdict = -1
+    if not seen:
+        verdict = GEOMETRY
+    elif height < limits[0]:
+        verdict = GROUND
+    elif height > limits[1]:
+        verdict = HEIGHT
+    return verdict, x, y, z
+
+
 @njit(
     int64(
         *(int64[:, ::1], int64, WHOLE, COLUMNS, COLUMNS, float64[:, ::1]),
@@ -261,11 +299,9 @@ def solve(  # type: ignore[no-untyped-def]
     Args:
         pairs: [2, found], detections; ``source`` gives their index in the radar's columns.
         horizontal, vertical: columns of the radars, as ``describe`` has them.
-        board: [2, 3], phase centres in the rig frame of the reference instant.
+        board, up, limits: as ``judge`` has them.
         offset_db: [2], added to the radars' powers.
         pattern: [3], as ``describe`` has it.
-        up: [4], unit vector up in the rig frame, height of the rig origin.
-        limits: [2], lowest and largest height above ground.
         xyz: [n, 3], receives the points.
         out: [3, n], receives power dB, horizontal range, vertical range.
         counts: GEOMETRY, GROUND and HEIGHT are increased.
@@ -278,14 +314,9 @@ def solve(  # type: ignore[no-untyped-def]
     for n in range(found):
         h, v = source[pairs[0, n]], source[pairs[1, n]]
         r_h, cos_h, r_v, cos_v = float64(range_h[h]), float64(u[h]), float64(range_v[v]), float64(w[v])
-        seen, x, y, z = _locate(r_h, cos_h, r_v, cos_v, board)
-        height = up[0] * x + up[1] * y + up[2] * z + up[3]
-        if not seen:
-            counts[GEOMETRY] += 1
-        elif height < limits[0]:
-            counts[GROUND] += 1
-        elif height > limits[1]:
-            counts[HEIGHT] += 1
+        verdict, x, y, z = judge(r_h, cos_h, r_v, cos_v, board, up, limits)
+        if verdict >= 0:
+            counts[verdict] += 1
         else:
             sum_db = float64(power_h[h]) + offset_db[0] + float64(power_v[v]) + offset_db[1]
             out[0, kept] = 0.5 * sum_db + _loss_db(cos_v, pattern) + _loss_db(cos_h, pattern)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Association from its definition in float64: plain loops over pairs, one step of the paper after the other."""
+"""Association from its definition in float64: plain loops over pairs, the paper's rule and the optimal assignment."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from edge.config import AntennaSettings, AssociationSettings, Mounting
 from edge.frames import Detections, Float64
+
+SIDELOBE_BINS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,26 @@ class Seen:
     level_db: float
 
 
+@dataclass(frozen=True, slots=True)
+class Region:
+    """What is kept.
+
+    Args:
+        up: [3], unit vector up in the rig frame.
+        height_m: rig origin above ground.
+        lowest_m, highest_m: above ground.
+    """
+
+    up: Float64
+    height_m: float
+    lowest_m: float
+    highest_m: float
+
+    def holds(self, xyz: Float64 | None) -> bool:
+        """Whether there is such a point, and inside."""
+        return xyz is not None and self.lowest_m <= float(self.up @ xyz) + self.height_m <= self.highest_m
+
+
 def loss_db(cosine: float, antenna: AntennaSettings) -> float:
     """One-way loss across an array, dB."""
     angle_deg = math.degrees(math.asin(max(-1.0, min(1.0, cosine))))
@@ -45,15 +67,20 @@ def described(
     origin_m: Float64,
     offset_db: float,
     antenna: AntennaSettings,
-    fov_deg: float,
+    settings: AssociationSettings,
+    range_bin_m: float,
 ) -> list[Seen]:
-    """Detections inside the field of view with range from the common origin and comparable level."""
+    """Detections inside the field of view that are no sidelobes, with range from the common origin and level."""
     horizontal = detections.radar == "horizontal"
+    all_m, all_db = detections.range_m.astype(np.float64), detections.power_db.astype(np.float64)
     seen = []
     for index in range(len(detections)):
         r, c = float(detections.range_m[index]), float(detections.direction_cosine[index])
         p = float(detections.power_db[index])
-        if not (math.isfinite(r + c + p) and r > 0.0) or abs(c) > math.sin(math.radians(fov_deg)):
+        if not (math.isfinite(r + c + p) and r > 0.0) or abs(c) > math.sin(math.radians(settings.fov_deg)):
+            continue
+        same_range = np.abs(all_m - all_m[index]) <= SIDELOBE_BINS * range_bin_m
+        if np.any(same_range & np.isfinite(all_db) & (all_db > all_db[index] + settings.sidelobe_db)):
             continue
         direction = np.array([math.sqrt(1 - c * c), c, 0.0] if horizontal else [math.sqrt(1 - c * c), 0.0, c])
         off = board_m - origin_m
@@ -92,6 +119,51 @@ def paired(members: list[Seen], max_discrepancy_db: float) -> list[tuple[Seen, S
     return pairs
 
 
+def worth(h: Seen, v: Seen, sigma_m: float, scale_db: float) -> float:
+    """Log-likelihood of a pair over that of one at 3 sigma with equal levels: Gaussian ranges, logistic levels."""
+    apart, louder = (h.common_m - v.common_m) / sigma_m, abs(h.level_db - v.level_db) / (2.0 * scale_db)
+    log_cosh = louder + math.log1p(math.exp(-2.0 * louder)) - math.log(2.0)
+    return 0.5 * (3.0**2 - apart**2) - 2.0 * log_cosh
+
+
+def worthiest(value: Float64) -> list[tuple[int, int]]:
+    """One-to-one assignment of the largest total value: ever better augmenting paths (Bellman-Ford), until none helps.
+
+    Args:
+        value: [rows, columns]; what is not positive is no candidate.
+    Returns:
+        Pairs (row, column) in order of the rows.
+    """
+    rows, columns = value.shape
+    owner: dict[int, int] = {}
+    while True:
+        free = [i for i in range(rows) if i not in owner.values()]
+        gain_row: dict[int, float] = dict.fromkeys(free, 0.0)
+        gain_column, before = np.full(columns, -np.inf), np.full(columns, -1)
+        changed = True
+        while changed:
+            changed = False
+            for i, gain in list(gain_row.items()):
+                candidate = np.where(value[i] > 0.0, gain + value[i], -np.inf)
+                for j in np.flatnonzero(candidate > gain_column + 1e-12).tolist():
+                    if owner.get(j) == i:
+                        continue
+                    gain_column[j], before[j], changed = candidate[j], i, True
+                    if j in owner:
+                        gain_row[owner[j]] = gain_column[j] - value[owner[j], j]
+        ends = [(gain_column[j], j, -1) for j in range(columns) if j not in owner]
+        ends += [(gain_row[i], j, i) for j, i in owner.items() if i in gain_row]  # row i gives its column up
+        best, j, _ = max(ends, default=(0.0, -1, -1))
+        if best <= 1e-12:
+            return sorted((i, j) for j, i in owner.items())
+        while j >= 0:
+            i = int(before[j])
+            left = next((k for k, row in owner.items() if row == i), -1)
+            owner.pop(left, None)
+            owner[j] = i
+            j = left
+
+
 def located(h: Seen, v: Seen, a: Float64, b: Float64) -> Float64 | None:
     """Point [3] of a pair, boards at a and b: (r_h, u) meets the plane z, (r_v, w) the plane y; mean of both x."""
     y, z = a[1] + h.range_m * h.cosine, b[2] + v.range_m * v.cosine
@@ -102,6 +174,20 @@ def located(h: Seen, v: Seen, a: Float64, b: Float64) -> Float64 | None:
     if min(squares) < 0.0:
         return None
     return np.array([0.5 * (a[0] + math.sqrt(squares[0]) + b[0] + math.sqrt(squares[1])), y, z])
+
+
+def assigned(
+    seen: list[Seen], a: Float64, b: Float64, region: Region, range_bin_m: float, settings: AssociationSettings
+) -> list[tuple[Seen, Seen]]:
+    """Rule "optimal": the worthiest one-to-one assignment of the pairs within the gate that are points to keep."""
+    horizontal, vertical = [s for s in seen if s.horizontal], [s for s in seen if not s.horizontal]
+    gate_m = settings.range_gate_bins * range_bin_m
+    value = np.zeros((len(horizontal), len(vertical)))
+    for i, h in enumerate(horizontal):
+        for j, v in enumerate(vertical):
+            if abs(h.common_m - v.common_m) <= gate_m and region.holds(located(h, v, a, b)):
+                value[i, j] = worth(h, v, gate_m / 3.0, settings.level_scale_db)
+    return [(horizontal[i], vertical[j]) for i, j in worthiest(value)]
 
 
 def associate(
@@ -126,7 +212,8 @@ def associate(
         range_bin_m: of both radars.
         settings, antenna: gate, limits, pattern.
     Returns:
-        float64 [n, 6]: x, y, z, power dB, horizontal range, vertical range; nearest range bin first, strongest first.
+        float64 [n, 6]: x, y, z, power dB, horizontal range, vertical range; nearest first (paper: strongest first
+        inside a range bin).
     """
     delay_s = (vertical.t_first_chirp_ns - horizontal.t_first_chirp_ns) * 1e-9
     a = np.array(mountings[0].position_m)
@@ -134,14 +221,19 @@ def associate(
     origin = np.array([0.5 * (a[0] + b[0]), b[1], a[2]])
     seen = []
     for detections, board, mounting in ((horizontal, a, mountings[0]), (vertical, b, mountings[1])):
-        seen += described(detections, board, origin, mounting.power_offset_db, antenna, settings.fov_deg)
+        seen += described(detections, board, origin, mounting.power_offset_db, antenna, settings, range_bin_m)
     seen.sort(key=lambda s: (s.common_m, s.level_db, not s.horizontal, s.index))
+    region = Region(up, height_m, settings.ground_margin_m, settings.max_height_m)
+    if settings.rule == "paper":
+        bins = range_bins(seen, settings.range_gate_bins * range_bin_m)
+        pairs = [pair for members in bins for pair in paired(members, settings.max_discrepancy_db)]
+    else:
+        pairs = assigned(seen, a, b, region, range_bin_m, settings)
     rows = []
-    for members in range_bins(seen, settings.range_gate_bins * range_bin_m):
-        for h, v in paired(members, settings.max_discrepancy_db):
-            xyz = located(h, v, a, b)
-            if xyz is None or not settings.ground_margin_m <= float(up @ xyz) + height_m <= settings.max_height_m:
-                continue
-            compensated = (h.power_db + 2 * loss_db(v.cosine, antenna), v.power_db + 2 * loss_db(h.cosine, antenna))
-            rows.append([*xyz.tolist(), 0.5 * sum(compensated), h.range_m, v.range_m])
+    for h, v in pairs:
+        xyz = located(h, v, a, b)
+        if xyz is None or not region.holds(xyz):
+            continue
+        compensated = (h.power_db + 2 * loss_db(v.cosine, antenna), v.power_db + 2 * loss_db(h.cosine, antenna))
+        rows.append([*xyz.tolist(), 0.5 * sum(compensated), h.range_m, v.range_m])
     return np.array(rows, dtype=np.float64).reshape(-1, 6)

@@ -12,7 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.config import AntennaSettings, AssociationSettings, CfarSettings, Mounting, RigGeometry
+from edge.config import (
+    ASSOCIATION_RULES,
+    AntennaSettings,
+    AssociationRule,
+    AssociationSettings,
+    CfarSettings,
+    Mounting,
+    RigGeometry,
+)
 from edge.dsp.antenna import across_loss_db
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
@@ -83,7 +91,7 @@ def test_one_target_seen_by_both_lies_where_it_is() -> None:
 def test_equal_counts_pair_by_power_rank_whatever_the_discrepancy() -> None:
     horizontal = [[5.0, 0.1, 30.0], [5.0, 0.2, 20.0], [5.0, 0.3, 10.0]]
     vertical = [[5.0, -0.1, 2.0], [5.0, -0.3, 9.0], [5.0, -0.2, 7.0]]
-    associator = Associator(rig())
+    associator = Associator(rig(rule="paper"))
     cloud = associator.process(*both(horizontal, vertical))
     np.testing.assert_allclose(cloud.xyz_m[:, 1] / 5.0, [0.1, 0.2, 0.3], rtol=1e-6)
     np.testing.assert_allclose(cloud.xyz_m[:, 2] / 5.0, [-0.3, -0.2, -0.1], rtol=1e-6)
@@ -94,7 +102,7 @@ def test_equal_counts_pair_by_power_rank_whatever_the_discrepancy() -> None:
 def test_unequal_counts_pair_strongest_first_until_3_db() -> None:
     horizontal = [[5.0, 0.1, 30.0], [5.0, 0.2, 20.0], [5.0, 0.3, 10.0], [5.0, 0.4, 5.0]]
     vertical = [[5.0, -0.1, 28.0], [5.0, -0.2, 16.9], [5.0, -0.3, 10.0]]
-    associator = Associator(rig())
+    associator = Associator(rig(rule="paper"))
     cloud = associator.process(*both(horizontal, vertical))
     np.testing.assert_allclose(cloud.xyz_m[:, 1:] / 5.0, [[0.1, -0.1]], rtol=1e-6)
     report = associator.last_report
@@ -102,7 +110,7 @@ def test_unequal_counts_pair_strongest_first_until_3_db() -> None:
 
 
 def test_a_discrepancy_of_exactly_the_limit_still_pairs() -> None:
-    associator = Associator(rig())
+    associator = Associator(rig(rule="paper"))
     assert len(associator.process(*both([[5, 0.1, 10], [5, 0.2, 4]], [[5, 0.0, 7]]))) == 1
     assert len(associator.process(*both([[5, 0.1, 10.01], [5, 0.2, 4]], [[5, 0.0, 7]]))) == 0
 
@@ -115,7 +123,7 @@ def test_two_targets_in_one_bin_keep_their_own_angles() -> None:
         [observed(p, [0, 0, 0], 1, power) for p, power in zip(points, powers, strict=True)],
         [observed(p, [0, 0, 0], 2, power) for p, power in zip(points, powers, strict=True)],
     )
-    cloud = Associator(rig()).process(*frames)
+    cloud = Associator(rig(rule="paper")).process(*frames)
     np.testing.assert_allclose(cloud.xyz_m, points[::-1], atol=1e-5)
 
 
@@ -132,7 +140,7 @@ def test_a_chain_longer_than_the_gate_is_cut_at_its_widest_gap() -> None:
     ranges = 5.0 + BIN_M * gaps_bins
     horizontal = [[ranges[0], 0.1, 1.0], [ranges[2], 0.2, 9.0]]
     vertical = [[ranges[1], -0.1, 9.0], [ranges[3], -0.2, 1.0]]
-    associator = Associator(rig())
+    associator = Associator(rig(rule="paper"))
     cloud = associator.process(*both(horizontal, vertical))
     assert associator.last_report.bins == 2
     np.testing.assert_allclose(cloud.range_horizontal_m, ranges[[0, 2]], rtol=1e-6)
@@ -142,7 +150,7 @@ def test_a_chain_longer_than_the_gate_is_cut_at_its_widest_gap() -> None:
 def test_of_equal_gaps_the_nearest_is_cut() -> None:
     """Horizontal 1 dB, vertical 1, horizontal 8, vertical 8, all 1/32 m apart: the last three are one bin."""
     horizontal, vertical = [[5.0, 0.1, 1.0], [5.0625, 0.2, 8.0]], [[5.03125, -0.1, 1.0], [5.09375, -0.2, 8.0]]
-    cloud = Associator(rig(range_gate_bins=0.6)).process(*both(horizontal, vertical))
+    cloud = Associator(rig(rule="paper", range_gate_bins=0.6)).process(*both(horizontal, vertical))
     np.testing.assert_array_equal(cloud.range_horizontal_m, np.float32([5.0625]))
     np.testing.assert_array_equal(cloud.range_vertical_m, np.float32([5.09375]))
 
@@ -183,9 +191,9 @@ def test_radial_travel_of_half_a_bin_between_the_bursts_still_pairs() -> None:
 def test_power_offsets_of_the_boards_are_added() -> None:
     boards = Mounting(power_offset_db=4.0), Mounting(power_offset_db=-2.0)
     frames = both([[5, 0.1, 10], [5, 0.2, 0]], [[5, 0.0, 16]])
-    cloud = Associator(rig(*boards)).process(*frames)
+    cloud = Associator(rig(*boards, rule="paper")).process(*frames)
     np.testing.assert_allclose(cloud.power_db, [14.0])
-    assert len(Associator(rig()).process(*frames)) == 0
+    assert len(Associator(rig(rule="paper")).process(*frames)) == 0
 
 
 def test_gain_across_the_array_is_compensated_by_the_other_radars_angle() -> None:
@@ -213,7 +221,7 @@ def test_ranks_follow_the_levels_that_both_radars_share() -> None:
 
 
 def test_ground_height_and_field_of_view_are_removed_and_counted() -> None:
-    associator = Associator(rig(geometry=RigGeometry(height_m=0.8), max_height_m=3.0))
+    associator = Associator(rig(rule="paper", geometry=RigGeometry(height_m=0.8), max_height_m=3.0))
     rows = {"below": (4.0, 0.1, -0.25), "above": (6.0, 0.1, 0.4), "kept": (8.0, 0.1, 0.0)}
     horizontal = [[r, u, 1.0] for r, u, _ in rows.values()] + [[10.0, 0.72, 1.0]]
     vertical = [[r, w, 1.0] for r, _, w in rows.values()] + [[10.0, -0.72, 1.0]]
@@ -237,7 +245,7 @@ def test_a_tilted_rig_judges_height_along_the_vertical() -> None:
 
 
 def test_directions_that_no_vector_has_are_ghosts() -> None:
-    associator = Associator(rig(fov_deg=60))
+    associator = Associator(rig(rule="paper", fov_deg=60))
     assert len(associator.process(*both([[5.0, 0.8, 1.0]], [[5.0, 0.65, 1.0]]))) == 0  # 0.64 + 0.4225 > 1
     assert associator.last_report.geometry == 1
     assert len(associator.process(*both([[5.0, 0.8, 1.0]], [[5.0, 0.59, 1.0]]))) == 1
@@ -309,13 +317,14 @@ def test_scatterers_come_out_of_raw_frames_where_they_are(sign: Literal[1, -1]) 
         "vertical": Mounting((0.03, 0.0, -0.15), array_sign=sign, range_offset_m=-0.05),
     }
     radars = {name: replace(radar, mounting=boards[name]) for name, radar in demo.radars.items()}
-    demo = replace(demo, radars=radars, geometry=RigGeometry(height_m=1.5))
+    isotropic = replace(demo.settings, antenna=AntennaSettings(along_loss_db=0.0, across_loss_db=0.0))
+    demo = replace(demo, radars=radars, geometry=RigGeometry(height_m=1.5), settings=isotropic)
     scatterers, velocity = np.array([[3.0, 1.2, -0.4], [4.5, -2.0, 0.7], [7.0, 3.0, 0.2]]), np.array([0.05, -0.2, 0.0])
-    cfar = replace(demo.settings.cfar, kind="ca", p_fa=1e-6)  # without noise an ordered statistic sees the sidelobes
+    cfar = replace(demo.settings.cfar, kind="ca", p_fa=1e-6)  # an ordered statistic sees the sidelobes
     seen = []
     for name, t_ns in (("horizontal", 0), ("vertical", HALF_NS)):
         radar = demo.radars[name]  # type: ignore[index]
-        frame = make_frame(radar, scatterers - velocity * t_ns * 1e-9, 200.0, 3, t_ns, velocity)
+        frame = make_frame(radar, scatterers - velocity * t_ns * 1e-9, 200.0, 3, t_ns, velocity, noise_lsb=10.0)
         heatmap = Imager(radar, demo.settings.heatmap, demo.settings.antenna).process(frame, velocity)
         seen.append(Detector(radar, cfar).process(heatmap))
     cloud = Associator(demo).process(seen[0], seen[1], velocity)
@@ -334,15 +343,18 @@ def random_rows(rng: np.random.Generator, count: int, clustered: bool) -> Any:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(0, 60), st.booleans(), st.sampled_from([0.25, 0.5, 1.5])
+    *(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(0, 60), st.booleans()),
+    *(st.sampled_from([0.25, 0.5, 1.5]), st.sampled_from(ASSOCIATION_RULES)),
 )
-def test_kernels_equal_the_definition(seed: int, n_h: int, n_v: int, clustered: bool, gate_bins: float) -> None:
+def test_kernels_equal_the_definition(
+    seed: int, n_h: int, n_v: int, clustered: bool, gate_bins: float, rule: AssociationRule
+) -> None:
     rng = np.random.default_rng(seed)
     boards = tuple(Mounting(tuple(rng.uniform(-0.2, 0.2, 3)), float(rng.uniform(-3, 3))) for _ in range(2))
     geometry = RigGeometry(height_m=0.8, pitch_deg=float(rng.uniform(-5, 5)), roll_deg=float(rng.uniform(-5, 5)))
     antenna, velocity = AntennaSettings(across_loss_db=2.0), rng.uniform(-2, 2, 3)
     frames = both(random_rows(rng, n_h, clustered), random_rows(rng, n_v, clustered), HALF_NS)
-    arrangement = rig(*boards, antenna, geometry, range_gate_bins=gate_bins, max_height_m=3.0)
+    arrangement = rig(*boards, antenna, geometry, rule=rule, range_gate_bins=gate_bins, max_height_m=3.0)
     associator = Associator(arrangement)
     cloud = associator.process(*frames, velocity)
     expected = associate(
@@ -353,6 +365,6 @@ def test_kernels_equal_the_definition(seed: int, n_h: int, n_v: int, clustered: 
     np.testing.assert_allclose(np.concatenate(columns, axis=1), expected, rtol=1e-5, atol=1e-5)
     report = associator.last_report
     assert report.horizontal + report.vertical == (
-        report.invalid + report.fov + report.unmatched + report.power + 2 * report.pairs
+        report.invalid + report.fov + report.sidelobe + report.unmatched + report.power + 2 * report.pairs
     )
     assert report.pairs == report.points + report.geometry + report.ground + report.height
