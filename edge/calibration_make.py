@@ -36,7 +36,6 @@ from edge.calibration_quality import (
     require_separable,
     residual_deg,
 )
-from edge.dsp.imager import RowGeometry
 from edge.dsp.tables import curvature_m
 from edge.errors import CalibrationError
 from edge.frames import Complex64, Float64
@@ -227,8 +226,8 @@ def _gain(
     dead: Bool,
 ) -> Complex128:
     """Factor that makes every channel see a boresight wave from the reflector's range; dead channels far off."""
-    geometry = RowGeometry.of(radar)
-    baked_m = curvature_m(reflector.range_m, geometry.transmit_m[:, None], geometry.receive_m[None, :])
+    transmit_m, receive_m = radar.array.element_offsets_m()
+    baked_m = curvature_m(reflector.range_m, transmit_m[:, None], receive_m[None, :])
     place_m = path_m - 2.0 * reflector.range_m - baked_m
     turn = np.exp(2j * np.pi * place_m / radar.schedule.profile.wavelength_m + 1j * np.pi * shift)
     gain = turn / np.where(dead, 1.0, tone)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from edge.calibration_capture import CaptureMean
 from edge.calibration_fit import phasor_fit
-from edge.dsp.imager import RowGeometry
 from edge.dsp.tables import window
 from edge.errors import CalibrationError
 from edge.frames import Float64
@@ -80,13 +79,13 @@ def require_separable(rms_deg: float, out: Path) -> None:
 
 def error_sidelobe_db(radar: Radar, residual_deg: Float64, level_db: Float64, kept: Bool) -> float:
     """Highest sidelobe that random errors of this size make on the Hann-tapered row, relative to the peak."""
-    geometry = RowGeometry.of(radar)
-    taper = window("hann", geometry.count, (geometry.count - 1) / 2)
-    weight = geometry.channel_weight(taper)
+    array = radar.array
+    taper = window("hann", array.count, (array.count - 1) / 2) / array.multiplicity
+    weight = np.where(array.position >= 0, taper[array.position], 0.0)
     used = kept & (weight > 0.0)
     amplitude = np.log(10.0) / 20.0 * (level_db[used] - level_db[used].mean())
     variance = np.mean(np.radians(residual_deg[used]) ** 2) + np.mean(amplitude**2)
-    power = variance * np.square(weight).sum() / weight.sum() ** 2 * np.log(geometry.count)
+    power = variance * np.square(weight).sum() / weight.sum() ** 2 * np.log(array.count)
     return float(10.0 * np.log10(max(float(power), 1e-12)))
 
 
@@ -106,3 +105,26 @@ def repeatability_deg(mean: CaptureMean) -> float | None:
     product = product[np.abs(product) > 0.0]
     turn = np.angle(product * product.mean().conj())
     return float(np.degrees(np.sqrt(np.mean(turn**2))))
+
+
+def quality_lines(quality: Quality) -> list[str]:
+    """The figures for people, each with what real boards show."""
+    rows = [
+        ("reflector over the floor", f"{quality.snr_db:.1f} dB a channel", "20 or more"),
+        ("over the next echo searched", _known(quality.margin_db, "dB", "no other echo"), "6 or more"),
+        ("phases: departure from TX + RX", f"{quality.separability_rms_deg:.1f} deg rms", "1 to 4"),
+        ("phases: two halves differ by", _known(quality.repeatability_rms_deg, "deg rms", "one loop"), "below 1"),
+        ("gain spread", f"{quality.gain_spread_db:.1f} dB", "1 to 5"),
+        ("delay spread", f"{quality.delay_spread_bins:.2f} range bins", "below 1"),
+        ("range offset, removed", f"{100 * quality.range_offset_m:+.1f} cm", "within a range bin"),
+        ("error sidelobe, at most", f"{quality.sidelobe_db:.1f} dB", "below -25"),
+        ("near over far half of range", f"{quality.image_rejection_db:+.1f} dB", "negative only for far reflectors"),
+        ("codes at the rails", f"{100 * quality.saturated_share:.3g} %", "below 0.01"),
+        ("echo turned", _known(quality.turn_deg, "deg", "one loop"), "below 30"),
+    ]
+    lines = [f"  {name:<32}{value:>20}   {usual}" for name, value, usual in rows]
+    return [*lines, f"  repaired channels: {', '.join(quality.repaired) or 'none'}"]
+
+
+def _known(value: float | None, unit: str, otherwise: str) -> str:
+    return otherwise if value is None else f"{value:.1f} {unit}"
