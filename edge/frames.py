@@ -147,6 +147,11 @@ class PointResponse:
         range_bias_m2: the two-way path's mean curvature; a target at (r, u) appears at r + bias (1 - u^2) / r.
         cosine_bias_m: slope of the curvature along the row, which tilts the wavefront.
         focus_inverse_m: 1 / (2 range) whose curvature is compensated everywhere; negative: each range has its own.
+        range_correlation, angle_correlation: complex128 [range], [angle], correlation of the noise of two bins by
+            their distance (edge/dsp/effective_cells.py); None: bins are independent.
+        range_envelope, angle_envelope: float64 [range], [angle], largest amplitude of a point at this distance in bins
+            or farther (edge/dsp/tables.py); None: unknown.
+        range_spread_bins: half the spread of the row's ranges to a target at direction cosine 1.
     """
 
     range_fit: Float64
@@ -155,6 +160,32 @@ class PointResponse:
     range_bias_m2: float
     cosine_bias_m: float
     focus_inverse_m: float
+    range_correlation: NDArray[np.complex128] | None = None
+    angle_correlation: NDArray[np.complex128] | None = None
+    range_envelope: Float64 | None = None
+    angle_envelope: Float64 | None = None
+    range_spread_bins: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class DopplerMaps:
+    """Range-angle power of every Doppler bin of one burst.
+
+    Args:
+        power: float32 [Doppler, angle, range], as in Heatmap; the imager's buffer.
+        fold: int8 [Doppler, range], multiple of ``interval_m_s`` plus ``most_folds``.
+        speed_m_s: float64 [Doppler], radial speed of each bin without folds, positive away, ascending.
+        interval_m_s: speeds that differ by this look alike from loop to loop.
+        most_folds: largest multiple of the interval.
+        delay_s: middle of the burst after its first chirp.
+    """
+
+    power: Float32
+    fold: NDArray[np.int8]
+    speed_m_s: Float64
+    interval_m_s: float
+    most_folds: int
+    delay_s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,70 +3,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import CfarSettings, require
+from edge.dsp.doppler import finish
 from edge.dsp.interpolation import PARABOLA
-from edge.dsp.kernels_cfar import mean_decisions, mean_peaks, rank_decisions_kernel, rank_peaks_kernel, ring_mean_kernel
+from edge.dsp.kernels_cfar import (
+    mean_decisions,
+    mean_peaks,
+    rank_decisions_kernel,
+    rank_peaks_kernel,
+    ring_halves_kernel,
+    ring_mean_kernel,
+)
 from edge.dsp.kernels_detect import refine, strongest
-from edge.dsp.threshold import cfar_scale, os_rank
+from edge.dsp.ring_tables import RingTables
 from edge.frames import Detections, Float32, Heatmap, PointResponse
 
 if TYPE_CHECKING:
     from edge.rig import Radar
 
 
-@dataclass(frozen=True, slots=True)
-class RingTables:
-    """What the CFAR needs for every range cell: the ring is cut at both ends of range.
-
-    Args:
-        first: first tested range cell; nearer ones take no part in any ring.
-        cells: int64 [R], training cells.
-        factor: float32 [R], threshold over the noise statistic (mean or ordered statistic).
-        inverse_count: float32 [R], 1 / cells.
-        allowed: int64 [R], cells - rank.
-    """
-
-    first: int
-    cells: NDArray[np.int64]
-    factor: Float32
-    inverse_count: Float32
-    allowed: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, settings: CfarSettings, ranges: int, first: int) -> RingTables:
-        """Tables for ``ranges`` cells of which those below ``first`` do not count."""
-        r = np.arange(ranges)
-
-        def inside(half_width: int) -> NDArray[np.int64]:
-            low, high = np.maximum(r - half_width, first), np.minimum(r + half_width, ranges - 1)
-            return np.asarray(np.maximum(high - low + 1, 0), dtype=np.int64)
-
-        box, guard = inside(settings.train_range), inside(settings.guard_range)
-        cells = box * (2 * settings.train_angle + 1) - guard * (2 * settings.guard_angle + 1)
-        rank = [os_rank(int(n), settings.os_quantile) for n in cells]
-        scale: dict[int, float] = {}
-        for n, k in zip(cells.tolist(), rank, strict=True):
-            if n not in scale:
-                scale[n] = cfar_scale(settings.kind, n, settings.p_fa, k) if n > 0 else np.inf
-        factor = np.array([scale[n] for n in cells.tolist()], dtype=np.float32)
-        inverse = (1.0 / np.maximum(cells, 1)).astype(np.float32)
-        return cls(first, cells, factor, inverse, cells - np.array(rank, dtype=np.int64))
-
-
 class Detector:
     """CFAR detection, local maxima and sub-bin estimation for one radar.
 
     The noise around a cell comes from a ring in range and angle, wrapped in angle, cut at both ends of range and at
-    ``min_range_m``; each number of remaining cells has its own factor for the same designed probability. The design
-    holds for independent exponential cells; a heatmap's cells are correlated by windows and zero padding. Decisions are
-    made on the heatmap's power; maxima are sought and interpolated in the power as received, before the compensation of
-    the antenna pattern, which would draw the peak of a wide lobe aside.
+    ``min_range_m``; each remaining ring has its own factor for the same designed probability, by the effective number
+    of its cells, which windows and zero padding correlate. Everything is decided, and maxima are sought and
+    interpolated, on the power as received, before the compensation of the antenna pattern: that would tilt the noise of
+    a ring and draw the peak of a wide lobe aside.
 
     Args:
         radar: which radar; only its identity is used, axes come with the heatmap.
@@ -85,10 +53,12 @@ class Detector:
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
         self._index = np.zeros(settings.max_detections, dtype=np.int64)
         self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
-        if settings.kind == "ca":
-            self._ring_mean = ring_mean_kernel(*self._ring)
-        else:
+        if settings.kind == "os":
             self._rank_peaks = rank_peaks_kernel(*self._ring)
+        elif settings.kind == "ca":
+            self._ring_noise = ring_mean_kernel(*self._ring)
+        else:
+            self._ring_noise = ring_halves_kernel(settings.kind == "go", *self._ring)
 
     def process(self, heatmap: Heatmap) -> Detections:
         """Detections of one heatmap; the columns are the caller's to keep.
@@ -107,7 +77,8 @@ class Detector:
         self.cut = count - kept
         self._refine(heatmap, kept)
         columns = self._columns[:, :kept].copy()
-        doppler = np.full(kept, np.nan, dtype=np.float32)
+        cells, ranges = self._cells[self._index[:kept]], heatmap.power.shape[1]
+        doppler = finish(heatmap, cells // ranges, cells % ranges, columns[0])
         return Detections(
             *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, columns[0], columns[1], columns[2]),
             *(doppler, columns[3]),
@@ -116,20 +87,26 @@ class Detector:
     def decisions(self, heatmap: Heatmap) -> NDArray[np.bool_]:
         """CFAR decision of every cell [angle, range] before the local-maximum test; for analysis, not for the road."""
         self._prepare(heatmap)
+        self._look_up(heatmap.response)
         decided = np.zeros(heatmap.power.shape, dtype=np.bool_)
         tables = self._tables
-        if self.settings.kind == "ca":
-            self._estimate(heatmap.power)
-            mean_decisions(heatmap.power, self._noise, tables.factor, tables.first, decided)
-        else:
+        if self.settings.kind == "os":
             kernel = rank_decisions_kernel(*self._ring)
-            kernel(heatmap.power, tables.first, tables.factor, tables.allowed, self._padded, decided)
+            kernel(heatmap.power, self._pattern, tables.first, tables.factor, tables.allowed, self._padded, decided)
+        else:
+            self._estimate(heatmap.power)
+            mean_decisions(heatmap.power, self._pattern, self._noise, tables.factor, tables.first, decided)
         return decided
 
     def noise(self, heatmap: Heatmap) -> Float32:
-        """Mean of every cell's ring [angle, range], as CA-CFAR uses it; valid until the next call."""
+        """Received noise [angle, range] that the means' CFAR (CA, GO, SO) compares with; valid until the next call.
+
+        Raises:
+            ConfigError: of an ordered-statistic detector, which makes no map.
+        """
+        require(self.settings.kind != "os", "cfar.kind", self.settings.kind, "ca, go, so for a map of the noise")
         self._prepare(heatmap)
-        self._ring_mean = ring_mean_kernel(*self._ring)
+        self._look_up(heatmap.response)
         self._estimate(heatmap.power)
         return self._noise
 
@@ -142,10 +119,11 @@ class Detector:
         angles, ranges = heatmap.power.shape
         train = self.settings.train_angle
         require(2 * train < angles, "cfar.train_angle", train, f"at most {(angles - 1) // 2} for {angles} angle bins")
-        first = int(np.searchsorted(range_m, self.settings.min_range_m))
-        self._tables = RingTables.of(self.settings, ranges, first)
-        self._line = np.zeros(ranges + 2 * self.settings.train_range, dtype=np.float32)
-        self._full = np.zeros((angles + 2 * train, ranges), dtype=np.float32)
+        self._first = int(np.searchsorted(range_m, self.settings.min_range_m))
+        self._tables = RingTables.of(self.settings, ranges, self._first)
+        width = ranges + 2 * self.settings.train_range + self.settings.guard_range
+        self._line = np.zeros((3, width), dtype=np.float32)
+        self._full = np.zeros((angles + 2 * train, width), dtype=np.float32)
         self._side = np.zeros_like(self._full)
         self._noise = np.zeros((angles, ranges), dtype=np.float32)
         self._cells = np.zeros(angles * (ranges + 1) // 4 + 1, dtype=np.int64)
@@ -169,23 +147,27 @@ class Detector:
             np.divide(1.0, response.gain, out=self._pattern)
             self._range_fit, self._angle_fit = response.range_fit, response.angle_fit
             self._axes[4:] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
+        self._tables = RingTables.of(self.settings, self._shape[1], self._first, response)
 
     def _estimate(self, power: Float32) -> None:
         tables = self._tables
-        self._ring_mean(power, tables.first, tables.inverse_count, self._line, self._full, self._side, self._noise)
+        self._ring_noise(
+            *(power, self._pattern, tables.first, tables.inverse_count, tables.floor),
+            *(self._line, self._full, self._side, self._noise),
+        )
 
     def _find(self, power: Float32) -> int:
         """Local maxima above the threshold into ``_cells`` and ``_estimates``."""
         tables = self._tables
-        if self.settings.kind == "ca":
-            self._estimate(power)
-            found = mean_peaks(
-                *(power, self._pattern, self._noise, tables.factor, tables.first, self._cells, self._estimates)
-            )
-        else:
+        if self.settings.kind == "os":
             found = self._rank_peaks(
                 *(power, self._pattern, tables.first, tables.factor, tables.allowed, self._padded, self._mark),
                 *(self._scratch, self._scratch.view(np.int32), self._cells, self._estimates),
+            )
+        else:
+            self._estimate(power)
+            found = mean_peaks(
+                *(power, self._pattern, self._noise, tables.factor, tables.first, self._cells, self._estimates)
             )
         return int(found)
 

@@ -14,6 +14,7 @@ from edge.config import AntennaSettings, HeatmapSettings, require
 from edge.dsp import tables, tdm
 from edge.dsp.antenna import along_loss_db
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
+from edge.dsp.effective_cells import noise_correlation
 from edge.dsp.interpolation import fit_response
 from edge.dsp.kernels_checks import all_zero, dead_channels
 from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
@@ -145,12 +146,12 @@ class Imager:
         """Complex windows before and focusing phasors after the range FFT, [block, (re, im), points * rx]."""
         layout, calibration, geometry = self.layout, self.radar.calibration, self.geometry
         samples, rx = layout.samples, layout.rx
-        taper = tables.window(self.settings.range_window, samples, samples / 2)
+        taper = tables.taper(self.settings, "range", samples, samples / 2)
         n = np.arange(samples)
         shift = np.asarray(calibration.range_shift_bins, dtype=np.float64)
         ramp = np.exp(-2j * np.pi * shift[..., None] * n / samples)
         channel = np.asarray(calibration.gain)[..., None] * ramp * (taper / taper.sum())
-        angle_taper = tables.window(self.settings.angle_window, geometry.count, (geometry.count - 1) / 2)
+        angle_taper = tables.taper(self.settings, "angle", geometry.count, (geometry.count - 1) / 2)
         weight = geometry.channel_weight(angle_taper / angle_taper.sum())
         frequency = tables.frequency_of_row(self.points)
         phase = np.zeros((*weight.shape, self.points))
@@ -169,6 +170,7 @@ class Imager:
         self._make_response(taper, angle_taper, weight)
 
     def _make_response(self, taper: Float64, angle_taper: Float64, weight: Float64) -> None:
+        noise = angle_taper**2 / np.where(self.geometry.multiplicity > 0, self.geometry.multiplicity, np.inf)
         """What motion and the spherical wavefront do to a target's peak: weighted least squares over the row.
 
         With p = a + b the position and q = a^2 + b^2 of a channel, the two-way path of a target at (r, u) is
@@ -176,6 +178,11 @@ class Imager:
         """
         a, b = self.geometry.transmit_m[:, None], self.geometry.receive_m[None, :]
         p, q = a + b, a * a + b * b
+            range_correlation=noise_correlation(taper**2, self.points),
+            angle_correlation=noise_correlation(noise, self.settings.angle_bins),
+            range_envelope=tables.response_envelope(taper, self.points),
+            angle_envelope=tables.response_envelope(angle_taper, self.settings.angle_bins),
+            range_spread_bins=float(np.abs(p[inside]).max() / (2.0 * bin_m)),
         mean_q = (weight * q).sum() / weight.sum()
         p = p - (weight * p).sum() / weight.sum()
         slope = weight * p / (weight * p * p).sum()

@@ -4,6 +4,9 @@
 Unsigned indices spare the inner loops Numba's wrap-around of negative ones, which would keep them from vectorising.
 The ring is a box of half widths ``train`` without the box of half widths ``guard``. Ranges below ``first`` belong to no
 ring and are not tested. Sums only add: a strong cell inside the guard box never enters the arithmetic.
+
+Everything is decided on the power as received, power * pattern: the compensation of the antenna pattern would tilt the
+noise of a ring.
 """
 
 from __future__ import annotations
@@ -17,21 +20,38 @@ from numba import boolean, float32, int32, int64, njit, types, uint64
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 
+MATRIX = float32[:, ::1]
+MEAN_ARGUMENTS = (MATRIX, float32[::1], int64, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
+
+
 @njit(inline="always")
-def _sum_along_range(power, a, first, guard, train, line, full, side, row):  # type: ignore[no-untyped-def]
-    """Box and guardless sums along range of one angle row; ``line`` has ``train`` zeros at both ends."""
-    ranges = power.shape[1]
+def _load(power, pattern, a, first, train, line):  # type: ignore[no-untyped-def]
+    """One angle row as received into ``line[0]``, which has ``train`` zeros at both ends; zeros below ``first``."""
+    ranges, level = power.shape[1], pattern[a]
     for r in range(ranges):
-        line[train + r] = power[a, r]
+        line[0, train + r] = power[a, r] * level
     for r in range(first):
-        line[train + r] = float32(0)
+        line[0, train + r] = float32(0)
+
+
+@njit(inline="always")
+def _close(planes, angles, train_angle):  # type: ignore[no-untyped-def]
+    """Repeat ``train_angle`` rows of the periodic axis at either end of a plane [angles + 2 train_angle, ...]."""
+    for t in range(train_angle):
+        planes[t] = planes[angles + t]
+        planes[angles + train_angle + t] = planes[train_angle + t]
+
+
+@njit(inline="always")
+def _sum_along_range(line, ranges, guard, train, full, side, row):  # type: ignore[no-untyped-def]
+    """Box and guardless sums along range of one loaded row."""
     for r in range(ranges):
         outer = float32(0)
         for d in range(train - guard):
-            outer += line[r + d] + line[r + train + guard + 1 + d]
+            outer += line[0, r + d] + line[0, r + train + guard + 1 + d]
         inner = float32(0)
         for d in range(2 * guard + 1):
-            inner += line[r + train - guard + d]
+            inner += line[0, r + train - guard + d]
         side[row, r] = outer
         full[row, r] = outer + inner
 
@@ -46,17 +66,15 @@ def ring_mean_kernel(guard_angle: int, train_angle: int, guard_range: int, train
         kernel(power [A, R], first, inverse_count [R], line [R + 2 train_range] zeroed, full, side
         [A + 2 train_angle, R], noise [A, R]): ``noise`` = mean of the ring's cells.
     """
-    matrix = float32[:, ::1]
 
-    @njit(types.void(matrix, int64, float32[::1], float32[::1], matrix, matrix, matrix), **OPTIONS)
-    def kernel(power, first, inverse_count, line, full, side, noise):  # type: ignore[no-untyped-def]
+    @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
+    def kernel(power, pattern, first, inverse_count, floor, line, full, side, noise):  # type: ignore[no-untyped-def]
         angles, ranges = power.shape
         for a in range(angles):
-            _sum_along_range(power, a, first, guard_range, train_range, line, full, side, a + train_angle)
-        for t in range(train_angle):
-            full[t], side[t] = full[angles + t], side[angles + t]
-            below = angles + train_angle + t
-            full[below], side[below] = full[train_angle + t], side[train_angle + t]
+            _load(power, pattern, a, first, train_range, line)
+            _sum_along_range(line, ranges, guard_range, train_range, full, side, a + train_angle)
+        _close(full, angles, train_angle)
+        _close(side, angles, train_angle)
         for a in range(angles):
             for r in range(ranges):
                 total = float32(0)
@@ -64,17 +82,70 @@ def ring_mean_kernel(guard_angle: int, train_angle: int, guard_range: int, train
                     total += full[a + d, r] + full[a + train_angle + guard_angle + 1 + d, r]
                 for d in range(2 * guard_angle + 1):
                     total += side[a + train_angle - guard_angle + d, r]
-                noise[a, r] = total * inverse_count[r]
+                noise[a, r] = total * inverse_count[0, r]
 
     return kernel
 
 
-@njit(types.void(float32[:, ::1], float32[:, ::1], float32[::1], int64, boolean[:, ::1]), **OPTIONS)
-def mean_decisions(power, noise, factor, first, decided):  # type: ignore[no-untyped-def]
-    """Decision of every cell: power > factor[range] * noise, before any local-maximum test; False below ``first``."""
+@cache
+def ring_halves_kernel(
+    greatest: bool, guard_angle: int, train_angle: int, guard_range: int, train_range: int
+) -> Callable[..., Any]:
+    """Compile the greatest-of or smallest-of noise estimate for one ring.
+
+    The sums along range of the nearer half are those of the farther one some cells before: each is made once.
+
+    Args:
+        greatest: the larger of both halves' means; else the smaller.
+        guard_angle, train_angle, guard_range, train_range: half widths in cells.
+    Returns:
+        kernel as ``ring_mean_kernel``'s; the mean of half h is its sum times ``inverse_count[h]`` plus ``floor[h]``.
+    """
+    beside, behind = train_range - guard_range, train_range + guard_range + 1
+
+    @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
+    def kernel(power, pattern, first, inverse_count, floor, line, full, side, noise):  # type: ignore[no-untyped-def]
+        angles, ranges = power.shape
+        for a in range(angles):
+            _load(power, pattern, a, first, train_range, line)
+            row = a + train_angle
+            for x in range(ranges + behind):
+                outer = float32(0)
+                for d in range(beside):
+                    outer += line[0, x + d]
+                inner = float32(0)
+                for d in range(guard_range):
+                    inner += line[0, x + beside + d]
+                side[row, x], full[row, x] = outer, outer + inner
+        _close(full, angles, train_angle)
+        _close(side, angles, train_angle)
+        for a in range(angles):
+            for x in range(ranges + behind):
+                outer = float32(0)
+                for d in range(train_angle - guard_angle):
+                    outer += full[a + d, x] + full[a + train_angle + guard_angle + 1 + d, x]
+                line[1, x] = outer
+            for x in range(ranges + behind):
+                inner = float32(0)
+                for d in range(2 * guard_angle + 1):
+                    inner += side[a + train_angle - guard_angle + d, x]
+                line[2, x] = inner
+            for r in range(ranges):
+                near = line[1, r] + line[2, r]
+                far = line[1, r + train_range + 1] + line[2, r + behind]
+                near = near * inverse_count[0, r] + floor[0, r]
+                far = far * inverse_count[1, r] + floor[1, r]
+                noise[a, r] = max(near, far) if greatest else min(near, far)
+
+    return kernel
+
+
+@njit(types.void(MATRIX, float32[::1], MATRIX, float32[::1], int64, boolean[:, ::1]), **OPTIONS)
+def mean_decisions(power, pattern, noise, factor, first, decided):  # type: ignore[no-untyped-def]
+    """Decision of every cell: received power > factor[range] * noise, before any local-maximum test."""
     for a in range(power.shape[0]):
         for r in range(power.shape[1]):
-            decided[a, r] = r >= first and power[a, r] > factor[r] * noise[a, r]
+            decided[a, r] = r >= first and power[a, r] * pattern[a] > factor[r] * noise[a, r]
 
 
 @njit(inline="always")
@@ -95,12 +166,12 @@ def _is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
 
 @njit(int64(float32[:, ::1], float32[::1], float32[:, ::1], float32[::1], int64, int64[::1], float32[::1]), **OPTIONS)
 def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: ignore[no-untyped-def]
-    """Local maxima of the received power among the cells above the threshold of a noise map.
+    """Local maxima of the received power that exceed the threshold of a noise map.
 
     Args:
         power: [A, R], compensated for the antenna pattern.
         pattern: [A], received power = power * pattern.
-        noise: [A, R].
+        noise: [A, R], as received.
         factor: [R].
         first: first tested range cell.
         cells: int64 [A R / 4], receives flat indices a R + r.
@@ -111,13 +182,13 @@ def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: 
     angles, ranges = power.shape
     count, begin = 0, uint64(first)
     for a in range(angles):
-        above = float32(0)
+        above, level = float32(0), pattern[a]
         for d in range(ranges - first):
             c = begin + uint64(d)
-            above += float32(1) if power[a, c] > factor[c] * noise[a, c] else float32(0)
+            above += float32(1) if power[a, c] * level > factor[c] * noise[a, c] else float32(0)
         if above > float32(0):
             for r in range(first, ranges):
-                if power[a, r] > factor[r] * noise[a, r] and _is_peak(power, pattern, a, r):
+                if power[a, r] * level > factor[r] * noise[a, r] and _is_peak(power, pattern, a, r):
                     cells[count] = a * ranges + r
                     estimate[count] = noise[a, r]
                     count += 1
@@ -125,13 +196,13 @@ def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: 
 
 
 @njit(inline="always")
-def _pad(power, first, train, padded):  # type: ignore[no-untyped-def]
-    """Copy the tested ranges into ``padded`` [A, R + 2 train], whose other cells hold -1 and count nowhere."""
+def _pad(power, pattern, first, train, padded):  # type: ignore[no-untyped-def]
+    """Copy the tested ranges, as received, into ``padded`` [A, R + 2 train]; its other cells hold -1, count nowhere."""
     angles, ranges = power.shape
     begin = uint64(first)
     for a in range(angles):
         for d in range(ranges - first):
-            padded[a, begin + uint64(train + d)] = power[a, begin + uint64(d)]
+            padded[a, begin + uint64(train + d)] = power[a, begin + uint64(d)] * pattern[a]
 
 
 @njit(inline="always")
@@ -227,7 +298,7 @@ def rank_peaks_kernel(guard_angle: int, train_angle: int, guard_range: int, trai
     def kernel(power, pattern, first, factor, allowed, padded, mark, scratch, bits, cells, estimate):  # type: ignore[no-untyped-def]
         angles, ranges = power.shape
         count = 0
-        _pad(power, first, train_range, padded)
+        _pad(power, pattern, first, train_range, padded)
         for a in range(angles):
             _mark_peaks(power, pattern, a, mark)
             for r in range(first, ranges):
@@ -253,15 +324,13 @@ def rank_decisions_kernel(guard_angle: int, train_angle: int, guard_range: int, 
     Args:
         guard_angle, train_angle, guard_range, train_range: half widths in cells.
     Returns:
-        kernel(power [A, R], first, factor [R], allowed [R], padded, decided bool [A, R]): power > factor x_(k).
+        kernel(power [A, R], pattern [A], first, factor [R], allowed [R], padded, decided bool [A, R]).
     """
-    signature = types.void(
-        float32[:, ::1], int64, float32[::1], int64[::1], float32[:, ::1], boolean[:, ::1]
-    )  # fmt: skip
+    signature = types.void(MATRIX, float32[::1], int64, float32[::1], int64[::1], MATRIX, boolean[:, ::1])
 
     @njit(signature, **OPTIONS)
-    def kernel(power, first, factor, allowed, padded, decided):  # type: ignore[no-untyped-def]
-        _pad(power, first, train_range, padded)
+    def kernel(power, pattern, first, factor, allowed, padded, decided):  # type: ignore[no-untyped-def]
+        _pad(power, pattern, first, train_range, padded)
         for a in range(power.shape[0]):
             for r in range(first, power.shape[1]):
                 decided[a, r] = _exceeds_rank(

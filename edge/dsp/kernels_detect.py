@@ -113,7 +113,7 @@ def refine(power, pattern, cells, index, estimate, count, range_fit, angle_fit, 
         power: [A, R], compensated for the antenna pattern.
         pattern: float32 [A], received power = power * pattern.
         cells, index: peak n is cell ``cells[index[n]]``.
-        estimate: noise power, by place in ``cells``.
+        estimate: received noise power, by place in ``cells``.
         count: peaks.
         range_fit, angle_fit: [10], coefficients of the axes.
         axes: float64 [7]: range of bin 0, range bin, cosine of row 0, cosine step, range_bias_m2, cosine_bias_m,
@@ -141,8 +141,8 @@ def refine(power, pattern, cells, index, estimate, count, range_fit, angle_fit, 
         cosine += axes[5] * (0.5 * across * inverse - focused)
         cosine -= period * np.floor(cosine / period + 0.5)
         amplitude = centre * height_r * height_a
-        peak = amplitude * amplitude / _pattern_at(pattern, a, da)
+        received = amplitude * amplitude
         out[0, n] = range_m - axes[4] * across * inverse
         out[1, n] = cosine
-        out[2, n] = 10.0 * np.log10(peak)
-        out[3, n] = 10.0 * np.log10(peak / float64(max(estimate[index[n]], float32(1e-30))))
+        out[2, n] = 10.0 * np.log10(received / _pattern_at(pattern, a, da))
+        out[3, n] = 10.0 * np.log10(received / float64(max(estimate[index[n]], float32(1e-30))))

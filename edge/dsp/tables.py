@@ -3,29 +3,81 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.config import WindowName
+from edge.config import HeatmapSettings, WindowName
 from edge.frames import Float32, Float64
 
 Int64 = NDArray[np.int64]
 Complex128 = NDArray[np.complex128]
+ENVELOPE_STEPS = 16
+"""Points a bin at which a response is searched for its sidelobes."""
 
 
-def window(name: WindowName, count: int, centre: float) -> Float64:
-    """Taper of ``count`` samples, symmetric about index ``centre``; the Hann period is ``count``.
+def taper(settings: HeatmapSettings, axis: Literal["range", "angle"], count: int, centre: float) -> Float64:
+    """The window that the settings name for one axis, as ``window`` makes it."""
+    name = settings.range_window if axis == "range" else settings.angle_window
+    return window(name, count, centre, settings.taylor_nbar, settings.taylor_sidelobe_db)
+
+
+def window(name: WindowName, count: int, centre: float, nbar: int = 5, sidelobe_db: float = 35.0) -> Float64:
+    """Taper of ``count`` samples, symmetric about index ``centre``; the period of Hann and Taylor is ``count``.
 
     Args:
-        name: "rectangular" or "hann" (Harris 1978, eq. 27).
+        name: "rectangular", "hann" (Harris 1978, eq. 27) or "taylor" (Taylor 1955; Carrara et al. 1995, app. D.2).
         count: samples.
         centre: count / 2 for the range window (where the architecture counts t_n from), (count - 1) / 2 for the array.
+        nbar, sidelobe_db: of the Taylor window: sidelobes kept level, and how far below the peak.
     Returns:
         float64 [count], largest value about 1.
     """
     if name == "rectangular":
         return np.ones(count)
-    return 0.5 + 0.5 * np.cos(2.0 * np.pi * (np.arange(count) - centre) / count)
+    turn = 2.0 * np.pi * (np.arange(count) - centre) / count
+    if name == "hann":
+        return 0.5 + 0.5 * np.cos(turn)
+    coefficients = taylor_coefficients(nbar, sidelobe_db)
+    order = np.arange(1, nbar)
+    return np.asarray((1.0 + 2.0 * np.cos(np.outer(turn, order)) @ coefficients) / (1.0 + 2.0 * coefficients.sum()))
+
+
+def taylor_coefficients(nbar: int, sidelobe_db: float) -> Float64:
+    """F_m, m = 1..nbar - 1, of w(x) = 1 + 2 sum_m F_m cos(2 pi m x), |x| <= 1/2 (Carrara et al. 1995, app. D.2).
+
+    F_m = (-1)^(m+1) / 2 prod_{i < nbar} (1 - m^2 / s_i^2) / prod_{i < nbar, i != m} (1 - m^2 / i^2) with zeros moved to
+    s_i^2 = s^2 (A^2 + (i - 1/2)^2), s^2 = nbar^2 / (A^2 + (nbar - 1/2)^2), A = arcosh(10^(sidelobe_db / 20)) / pi.
+    """
+    a2 = (np.arccosh(10.0 ** (sidelobe_db / 20.0)) / np.pi) ** 2
+    i = np.arange(1, nbar, dtype=np.float64)
+    zeros = nbar**2 / (a2 + (nbar - 0.5) ** 2) * (a2 + (i - 0.5) ** 2)
+    m2 = np.square(i)[:, None]
+    others = np.where(np.eye(nbar - 1, dtype=bool), 1.0, 1.0 - m2 / np.square(i))
+    return np.asarray(-0.5 * (-1.0) ** i * np.prod(1.0 - m2 / zeros, axis=1) / np.prod(others, axis=1))
+
+
+def response_envelope(taper: Float64, bins: int) -> Float64:
+    """Bound of a point's amplitude in a bin, relative to its peak bin, by the distance between the two bins.
+
+    The point stands anywhere within its peak bin, so that a distance of d bins is at least d - 1/2 in truth; the bound
+    is the largest response from there on. It is 1 within the main lobe: what is there is a matter of resolution.
+
+    Args:
+        taper: [n] before the FFT.
+        bins: FFT length.
+    Returns:
+        float64 [bins], periodic: distance d and bins - d are the same.
+    """
+    response = np.abs(np.fft.fft(taper, ENVELOPE_STEPS * bins))[: ENVELOPE_STEPS * bins // 2 + 1]
+    response /= response[0]
+    rising = np.diff(response) > 0.0
+    null = int(np.argmax(rising)) if rising.any() else len(response) - 1
+    bound = np.maximum.accumulate(response[::-1])[::-1]
+    bound = np.where(np.arange(len(bound)) < null, 1.0, np.minimum(bound / response[ENVELOPE_STEPS // 2], 1.0))
+    distance = np.minimum(np.arange(bins), bins - np.arange(bins))
+    return np.asarray(bound[np.maximum(ENVELOPE_STEPS * distance - ENVELOPE_STEPS // 2, 0)])
 
 
 def next_power_of_two(count: int) -> int:

@@ -23,7 +23,7 @@ def main(count: int) -> None:
     points = np.c_[rng.uniform(2, 12, 15), rng.uniform(-4, 4, 15), rng.uniform(-1, 1, 15)]
     frame = make_frame(radar, points, rng.uniform(20, 200, 15), 0, 0, noise_lsb=25.0, rng=rng)
     imager = Imager(radar, HeatmapSettings(), AntennaSettings())
-    ca, os_ = (Detector(radar, CfarSettings(kind=kind)) for kind in ("ca", "os"))
+    ca, os_, go = (Detector(radar, CfarSettings(kind=kind)) for kind in ("ca", "os", "go"))
     heatmap = imager.process(frame)
     heatmap = dataclasses.replace(heatmap, power=heatmap.power.copy())
     print(f"{len(ca.process(heatmap))} CA detections, {len(os_.process(heatmap))} OS detections")
@@ -43,6 +43,7 @@ def main(count: int) -> None:
             *(power, ca._pattern, ca._noise, tables.factor, tables.first, ca._cells, ca._estimates)
         ),
         "detector CA": lambda: ca.process(heatmap),
+        "detector GO": lambda: go.process(heatmap),
         "peaks OS": lambda: os_._rank_peaks(
             *(power, os_._pattern, rank.first, rank.factor, rank.allowed, os_._padded, os_._mark),
             *(os_._scratch, os_._scratch.view(np.int32), os_._cells, os_._estimates),

@@ -13,12 +13,13 @@ import pytest
 from edge.config import CfarSettings
 from edge.dsp.detector import Detector
 from edge.dsp.interpolation import PARABOLA
-from edge.dsp.threshold import cfar_scale, os_rank
+from edge.dsp.threshold import cfar_scale, incomplete_beta, os_rank
 from edge.errors import ConfigError
 from edge.frames import Heatmap, PointResponse
 from edge.reference import cfar as definition
 
 RADAR = SimpleNamespace(radar="horizontal")
+KINDS = ["ca", "go", "so", "os"]
 
 
 def heatmap(power, first_range_m=0.0):
@@ -47,6 +48,31 @@ class TestScale:
         assert cfar_scale("os", 1, 0.1, 1) == pytest.approx(9.0)
         assert cfar_scale("os", 16, 1e-6, 12) == pytest.approx(20.9, abs=0.1), "Rohling 1983, table for N = 16, k = 12"
 
+    @pytest.mark.parametrize(("cells", "other"), [(1, 1), (8, 8), (206, 206), (206, 15), (15, 206), (3, 60)])
+    @pytest.mark.parametrize("p_fa", [1e-2, 1e-4, 1e-6])
+    @pytest.mark.parametrize("kind", ["go", "so"])
+    def test_halves_invert_the_integral(self, kind, cells, other, p_fa):
+        factor = cfar_scale(kind, cells, p_fa, other=other)
+        probability = definition.false_alarm_probability(kind, cells, 0, factor, other)
+        assert probability == pytest.approx(p_fa, rel=2e-4)
+
+    def test_halves_of_one_cell_have_a_closed_form(self):
+        """exp(-T min) of two unit exponentials has the mean 2 / (2 + T), of the greater one 2 / (1 + T) less that."""
+        assert cfar_scale("so", 1, 0.1, other=1) == pytest.approx(18.0)
+        t = cfar_scale("go", 1, 0.1, other=1)
+        assert 2.0 / (1.0 + t) - 2.0 / (2.0 + t) == pytest.approx(0.1)
+
+    @pytest.mark.parametrize("kind", ["go", "so"])
+    def test_an_empty_half_leaves_cell_averaging(self, kind):
+        expected = cfar_scale("ca", 33, 1e-3)
+        assert cfar_scale(kind, 0, 1e-3, other=33) == cfar_scale(kind, 33, 1e-3, other=0) == expected
+
+    def test_incomplete_beta_is_scipys(self):
+        betainc = pytest.importorskip("scipy.special").betainc
+        for a, b in ((0.5, 0.5), (1.0, 7.3), (20.0, 3.7), (200.0, 2000.0)):
+            for x in (0.0, 1e-6, 0.1, 0.5, a / (a + b), 0.999, 1.0):
+                assert incomplete_beta(a, b, x) == pytest.approx(betainc(a, b, x), rel=1e-9, abs=1e-14)
+
     def test_rank_outside_the_cells_is_refused(self):
         with pytest.raises(ConfigError, match="rank"):
             cfar_scale("os", 16, 1e-3, 17)
@@ -65,7 +91,7 @@ def false_alarm_rates(kind, p_fa, maps, ranges, seed):
     return hits[edge].sum() / (maps * 256 * edge.sum()), hits[~edge].sum() / (maps * 256 * (~edge).sum())
 
 
-@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("p_fa", "maps"), [(1e-2, 250), (1e-3, 2500)])
 def test_false_alarm_rate_is_the_designed_one_inside_and_at_both_ends(kind, p_fa, maps):
     """About 10,000 events each: the standard deviation of a rate is 1 %, the limit 5 %."""
@@ -78,7 +104,7 @@ SPACED_ROWS = np.arange(0, 4095, 5)
 """Angle rows whose rings, of half width 2, have no cell in common."""
 
 
-@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("p_fa", "maps"), [(1e-2, 300), (1e-3, 3000), pytest.param(1e-4, 30000, marks=pytest.mark.slow)]
 )
@@ -110,14 +136,22 @@ def test_false_alarm_rate_holds_where_the_angle_axis_closes():
     assert rate[-8:].mean() == pytest.approx(1e-2, rel=0.08)
 
 
-@pytest.mark.parametrize("kind", ["ca", "os"])
+def independent_factor(chosen, r, first, ranges):
+    """Factor for the ring at range r by counting its cells."""
+    ones = np.ones((2 * chosen.train_angle + 1, ranges))
+    count = [len(definition.ring_values(ones, chosen.train_angle, r, chosen, first, side)) for side in (0, -1, 1)]
+    if chosen.kind in ("go", "so"):
+        return cfar_scale(chosen.kind, count[1], chosen.p_fa, other=count[2])
+    return cfar_scale(chosen.kind, count[0], chosen.p_fa, os_rank(count[0], chosen.os_quantile))
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "shape",
     [
         (6, 14, 2, 8),
-        (14, 24, 2, 8),
         (1, 5, 3, 12),
-        *(pytest.param(s, marks=pytest.mark.slow) for s in [(0, 1, 0, 1), (3, 4, 0, 2)]),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in [(14, 24, 2, 8), (0, 1, 0, 1), (3, 4, 0, 2)]),
     ],
 )
 def test_every_decision_is_that_of_brute_force(kind, shape):
@@ -139,7 +173,7 @@ def test_every_decision_is_that_of_brute_force(kind, shape):
         power.astype(float),
         chosen,
         first,
-        lambda n: cfar_scale(kind, n, 0.03, os_rank(n, chosen.os_quantile)),
+        lambda r: independent_factor(chosen, r, first, 70),
         cells,
     )
     decided = Detector(RADAR, chosen).decisions(heatmap(power))
@@ -148,9 +182,9 @@ def test_every_decision_is_that_of_brute_force(kind, shape):
     assert not decided[:, :first].any()
 
 
-@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_peak_is_that_of_brute_force(kind):
-    """Decisions on the compensated power, maxima of the received one; plateaus and both ends of either axis."""
+    """Decisions on the received power, its maxima; plateaus and both ends of either axis."""
     rng = np.random.default_rng(12)
     pattern = np.exp(-(np.linspace(-2, 2, 64) ** 2)).astype(np.float32)
     received = rng.standard_exponential((64, 50)).astype(np.float32)
@@ -169,7 +203,7 @@ def test_every_peak_is_that_of_brute_force(kind):
     assert {50 * 11 + 15, 30 * 50 + 30} <= set(expected)
 
 
-@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("exponent", [-20, 20])
 def test_scaling_by_a_power_of_two_changes_nothing_at_all(kind, exponent):
     """Floating-point products with 2^n are exact: here every decision must be the same."""
@@ -180,7 +214,7 @@ def test_scaling_by_a_power_of_two_changes_nothing_at_all(kind, exponent):
     assert np.array_equal(detector.decisions(heatmap(power * np.float32(2.0**exponent))), plain)
 
 
-@pytest.mark.parametrize("kind", ["ca", "os"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_scaling_changes_no_decision(kind, scale):
     power = np.random.default_rng(1).standard_exponential((256, 64)).astype(np.float32)
@@ -189,6 +223,28 @@ def test_scaling_changes_no_decision(kind, scale):
     assert (plain != scaled).mean() < 1e-4
     one, other = detector.process(heatmap(power)), detector.process(heatmap(power * np.float32(scale)))
     assert len(one) == pytest.approx(len(other), abs=1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_antenna_s_compensation_changes_no_decision(kind):
+    """What is compensated by powers of two is decided as it was received, exactly."""
+    rng = np.random.default_rng(21)
+    received = rng.standard_exponential((64, 50)).astype(np.float32)
+    gain = (2.0 ** rng.integers(0, 12, 64)).astype(np.float32)
+    response = PointResponse(PARABOLA, PARABOLA, gain, 0.0, 0.0, 0.0)
+    compensated = dataclasses.replace(heatmap(received * gain[:, None]), response=response)
+    one, other = (Detector(RADAR, settings(kind, 0.05)).decisions(m) for m in (heatmap(received), compensated))
+    assert one.any()
+    assert np.array_equal(one, other)
+
+
+def test_greatest_and_smallest_choose_their_side_of_a_step():
+    """A step of 30 dB in range: the greatest-of noise is the high side's, the smallest-of the low one's."""
+    power = np.ones((64, 64), dtype=np.float32)
+    power[:, 32:] = 1000.0
+    for kind, expected in (("go", 1000.0), ("so", 1.0)):
+        noise = Detector(RADAR, settings(kind)).noise(heatmap(power))
+        np.testing.assert_allclose(noise[:, [31, 32]], expected, rtol=1e-5)
 
 
 def test_a_peak_of_100_db_beside_does_not_touch_the_noise_estimate():

@@ -24,7 +24,7 @@ LARGEST_TEMPORARY_BYTES = 32768
 """Far below any plane of the road: a heatmap has 262,144 bytes."""
 
 
-@pytest.fixture(params=["ca", "os"])
+@pytest.fixture(params=["ca", "so", "os"])
 def road(request):
     radar = cascade_radar(loops=2)
     imager = Imager(radar, HeatmapSettings(), AntennaSettings())
@@ -60,7 +60,7 @@ def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(road
         strongest,
         refine,
     ]
-    kernels += [detector._rank_peaks] if detector.settings.kind == "os" else [detector._ring_mean, mean_peaks]
+    kernels += [detector._rank_peaks] if detector.settings.kind == "os" else [detector._ring_noise, mean_peaks]
     _nrt_python.memsys_enable_stats()
     try:
         before = rtsys.get_allocation_stats()
