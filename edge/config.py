@@ -14,12 +14,10 @@ from edge.errors import ConfigError
 
 WindowName = Literal["rectangular", "hann", "taylor"]
 CfarKind = Literal["ca", "go", "so", "os"]
-DopplerChoice = Literal["auto", "sum", "steer", "fft", "single"]
 PointEncoding = Literal["f4", "f2", "i2"]
 AssociationRule = Literal["optimal", "paper"]
 WINDOWS: tuple[WindowName, ...] = ("rectangular", "hann", "taylor")
 CFAR_KINDS: tuple[CfarKind, ...] = ("ca", "go", "so", "os")
-DOPPLER_CHOICES: tuple[DopplerChoice, ...] = ("auto", "sum", "steer", "fft", "single")
 POINT_ENCODINGS: tuple[PointEncoding, ...] = ("f4", "f2", "i2")
 ASSOCIATION_RULES: tuple[AssociationRule, ...] = ("optimal", "paper")
 
@@ -46,16 +44,19 @@ class HeatmapSettings:
 
     range_window: WindowName = "hann"
     angle_window: WindowName = "hann"
+    taylor_sidelobe_db: float = 35.0
+    taylor_nbar: int = 5
     angle_bins: int = 256
     focus: bool = True
     loops: int = 0
     max_saturated_share: float = 0.01
 
-    taylor_sidelobe_db: float = 35.0
-    taylor_nbar: int = 5
     def __post_init__(self) -> None:
         require(self.range_window in WINDOWS, "heatmap.range_window", self.range_window, ", ".join(WINDOWS))
         require(self.angle_window in WINDOWS, "heatmap.angle_window", self.angle_window, ", ".join(WINDOWS))
+        sidelobe_db = self.taylor_sidelobe_db
+        require(15.0 <= sidelobe_db <= 80.0, "heatmap.taylor_sidelobe_db", sidelobe_db, "15..80")
+        require(2 <= self.taylor_nbar <= 20, "heatmap.taylor_nbar", self.taylor_nbar, "2..20")
         power_of_two = self.angle_bins > 0 and self.angle_bins & (self.angle_bins - 1) == 0
         require(
             power_of_two and 64 <= self.angle_bins <= 4096,
@@ -63,9 +64,6 @@ class HeatmapSettings:
             self.angle_bins,
             "power of two, 64..4096",
         )
-        sidelobe_db = self.taylor_sidelobe_db
-        require(15.0 <= sidelobe_db <= 80.0, "heatmap.taylor_sidelobe_db", sidelobe_db, "15..80")
-        require(2 <= self.taylor_nbar <= 20, "heatmap.taylor_nbar", self.taylor_nbar, "2..20")
         require(self.loops >= 0, "heatmap.loops", self.loops, ">= 0 (0 = automatic)")
         require(0 < self.max_saturated_share <= 1, "heatmap.max_saturated_share", self.max_saturated_share, "0..1")
 
@@ -78,6 +76,8 @@ class CfarSettings:
         kind: cell averaging ("ca"), ordered statistic ("os"), or the greatest ("go") or smallest ("so") of the means of
             the ring's nearer and farther half in range; the cells at the tested range belong to neither half.
         p_fa: designed false-alarm probability per cell, on exponentially distributed power.
+        correlated: thresholds count the ring's effective number of independent cells, known from the heatmap's
+            windows; false takes all cells as independent and lets more false alarms through than designed.
         guard_range, guard_angle: half widths of the guard box in bins; in angle it must cover the main lobe (defaults
             for 86 elements with Hann taper on 256 bins), or a strong target counts as its own noise.
         train_range, train_angle: half widths of the training box in bins; the ring between them is the neighbourhood.
@@ -86,10 +86,9 @@ class CfarSettings:
         max_detections: strongest kept per radar and frame.
     """
 
-        correlated: thresholds count the ring's effective number of independent cells, known from the heatmap's
-            windows; false takes all cells as independent and lets more false alarms through than designed.
     kind: CfarKind = "ca"
     p_fa: float = 1e-6
+    correlated: bool = True
     guard_range: int = 2
     guard_angle: int = 6
     train_range: int = 8
@@ -98,7 +97,6 @@ class CfarSettings:
     min_range_m: float = 0.6
     max_detections: int = 512
 
-    correlated: bool = True
     def __post_init__(self) -> None:
         require(self.kind in CFAR_KINDS, "cfar.kind", self.kind, ", ".join(CFAR_KINDS))
         require(0.0 < self.p_fa < 0.5, "cfar.p_fa", self.p_fa, "0 < p_fa < 0.5")

@@ -168,27 +168,6 @@ class PointResponse:
 
 
 @dataclass(frozen=True, slots=True)
-class DopplerMaps:
-    """Range-angle power of every Doppler bin of one burst.
-
-    Args:
-        power: float32 [Doppler, angle, range], as in Heatmap; the imager's buffer.
-        fold: int8 [Doppler, range], multiple of ``interval_m_s`` plus ``most_folds``.
-        speed_m_s: float64 [Doppler], radial speed of each bin without folds, positive away, ascending.
-        interval_m_s: speeds that differ by this look alike from loop to loop.
-        most_folds: largest multiple of the interval.
-        delay_s: middle of the burst after its first chirp.
-    """
-
-    power: Float32
-    fold: NDArray[np.int8]
-    speed_m_s: Float64
-    interval_m_s: float
-    most_folds: int
-    delay_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class Heatmap:
     """Range-angle power of one radar.
 

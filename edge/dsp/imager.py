@@ -170,7 +170,6 @@ class Imager:
         self._make_response(taper, angle_taper, weight)
 
     def _make_response(self, taper: Float64, angle_taper: Float64, weight: Float64) -> None:
-        noise = angle_taper**2 / np.where(self.geometry.multiplicity > 0, self.geometry.multiplicity, np.inf)
         """What motion and the spherical wavefront do to a target's peak: weighted least squares over the row.
 
         With p = a + b the position and q = a^2 + b^2 of a channel, the two-way path of a target at (r, u) is
@@ -178,11 +177,6 @@ class Imager:
         """
         a, b = self.geometry.transmit_m[:, None], self.geometry.receive_m[None, :]
         p, q = a + b, a * a + b * b
-            range_correlation=noise_correlation(taper**2, self.points),
-            angle_correlation=noise_correlation(noise, self.settings.angle_bins),
-            range_envelope=tables.response_envelope(taper, self.points),
-            angle_envelope=tables.response_envelope(angle_taper, self.settings.angle_bins),
-            range_spread_bins=float(np.abs(p[inside]).max() / (2.0 * bin_m)),
         mean_q = (weight * q).sum() / weight.sum()
         p = p - (weight * p).sum() / weight.sum()
         slope = weight * p / (weight * p * p).sum()
@@ -193,6 +187,7 @@ class Imager:
         focus_inverse_m = -1.0 if self.settings.focus else 0.5 / self.radar.calibration.reference_range_m
         inside = weight > 0.0
         bin_m = float(self.range_m[1] - self.range_m[0])
+        noise = angle_taper**2 / np.where(self.geometry.multiplicity > 0, self.geometry.multiplicity, np.inf)
         self._response = PointResponse(
             range_fit=fit_response(taper, self.points, weight[inside], p[inside] / (2.0 * bin_m)),
             angle_fit=fit_response(angle_taper, self.settings.angle_bins, np.ones(1), np.zeros(1)),
@@ -200,6 +195,11 @@ class Imager:
             range_bias_m2=float(0.25 * mean_q),
             cosine_bias_m=float((slope * q).sum()),
             focus_inverse_m=focus_inverse_m,
+            range_correlation=noise_correlation(taper**2, self.points),
+            angle_correlation=noise_correlation(noise, self.settings.angle_bins),
+            range_envelope=tables.response_envelope(taper, self.points),
+            angle_envelope=tables.response_envelope(angle_taper, self.settings.angle_bins),
+            range_spread_bins=float(np.abs(p[inside]).max() / (2.0 * bin_m)),
         )
 
     def _make_buffers(self) -> None:
