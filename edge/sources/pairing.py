@@ -4,11 +4,12 @@
 Rules, for each radar by itself:
 
 * a number larger than the expected one: the numbers between are lost by GAP;
-* a number not larger than the one before (duplicate, reordered), or a time not later than that of the frame before:
-  the frame is lost by BACKWARDS_TIME;
+* a number not larger than the one before (duplicate, reordered) or more than 36,000 larger (ten minutes at 60 frames/s:
+  no gap but a wrong number), or a time not later than that of the frame before: the frame is lost by BACKWARDS_TIME;
 * the partner can no longer come, since the other radar is already past that number, or ``depth`` frames wait: UNPAIRED.
 
-The first frame of a radar sets its numbering; what was before it is nobody's loss.
+The first frame of a radar sets its numbering; what was before it is nobody's loss. After 30 refused numbers in a row
+the board must have restarted: the next frame sets the numbering anew, and no frame that waits will be paired any more.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ from edge.accounting import FrameLedger
 from edge.errors import CaptureError
 from edge.frames import LossCause, RadarFrame, RadarId
 from edge.sources.base import Loss
+
+MAX_GAP_FRAMES = 36_000
+"""Largest step of the numbers that is taken for missing frames: ten minutes at 60 frames/s."""
+REFUSED_NUMBERS = 30
+"""Refused in a row before the numbering counts as restarted: one absurd number must not end a radar, nor a reboot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +57,18 @@ class _Lane:
     ledger: FrameLedger
     last_number: int | None = None
     last_t_ns: int | None = None
+    refused_in_a_row: int = 0
     waiting: dict[int, RadarFrame] = field(default_factory=dict)
+
+    def refuses(self, number: int) -> str:
+        """Why a number does not continue this lane's numbering; empty: it does."""
+        if self.last_number is None:
+            return ""
+        if number <= self.last_number:
+            return f"number {number} came after {self.last_number}: duplicate or reordered"
+        if number - self.last_number > MAX_GAP_FRAMES:
+            return f"number {number} came after {self.last_number}: too far ahead to be a gap"
+        return ""
 
 
 class FramePairer:
@@ -94,39 +111,48 @@ class FramePairer:
             )
         losses: list[Loss] = []
         if isinstance(item, Loss):
-            self._gap(lane, item.radar, item.number, item.t_ns, losses)
-            lane.ledger.missing(item.cause, item.count)
-            lane.last_number = max(_or(lane.last_number, -1), item.number + item.count - 1)
-            losses.append(item)
-        elif not self._goes_backwards(lane, item, losses):
+            self._add_loss(lane, item, losses)
+        elif not self._refuse(lane, item, losses):
             self._gap(lane, item.radar, item.number, item.t_first_chirp_ns, losses)
             lane.ledger.frame_in()
             lane.last_number = item.number
             lane.last_t_ns = item.t_first_chirp_ns
+            lane.refused_in_a_row = 0
             lane.waiting[item.number] = item
         return self._settle(item.radar, losses), losses
 
     def flush(self) -> list[Loss]:
         """End of the source: every waiting frame is lost by UNPAIRED."""
         losses: list[Loss] = []
-        for radar, lane in self._lanes.items():
-            while lane.waiting:
-                self._drop_oldest(radar, "the source ended before the other radar's frame came", losses)
+        self._drop_all("the source ended before the other radar's frame came", losses)
         return losses
 
-    def _goes_backwards(self, lane: _Lane, frame: RadarFrame, losses: list[Loss]) -> bool:
-        number, t_ns = lane.last_number, lane.last_t_ns
-        if number is not None and frame.number <= number:
-            detail = f"number {frame.number} came after {number}: duplicate or reordered"
+    def _add_loss(self, lane: _Lane, loss: Loss, losses: list[Loss]) -> None:
+        """What the source lost is counted as it says; a number far ahead moves nothing."""
+        if lane.last_number is None or loss.number - lane.last_number <= MAX_GAP_FRAMES:
+            self._gap(lane, loss.radar, loss.number, loss.t_ns, losses)
+            lane.last_number = max(_or(lane.last_number, -1), loss.number + loss.count - 1)
+        lane.ledger.missing(loss.cause, loss.count)
+        losses.append(loss)
+
+    def _refuse(self, lane: _Lane, frame: RadarFrame, losses: list[Loss]) -> bool:
+        """Lose a frame whose number or time is out of order; restart the numbering after too many in a row."""
+        detail, t_ns = lane.refuses(frame.number), lane.last_t_ns
+        if detail:
+            lane.refused_in_a_row += 1
         elif t_ns is not None and frame.t_first_chirp_ns <= t_ns:
             detail = f"time stamp {(t_ns - frame.t_first_chirp_ns) / 1e6:.3f} ms before that of the frame before"
             self._gap(lane, frame.radar, frame.number, frame.t_first_chirp_ns, losses)
             lane.last_number = frame.number
             lane.last_t_ns = frame.t_first_chirp_ns
+            lane.refused_in_a_row = 0
         else:
             return False
         lane.ledger.missing(LossCause.BACKWARDS_TIME)
         losses.append(Loss(frame.radar, frame.number, LossCause.BACKWARDS_TIME, detail, frame.t_first_chirp_ns))
+        if lane.refused_in_a_row >= REFUSED_NUMBERS:
+            lane.last_number, lane.last_t_ns, lane.refused_in_a_row = None, None, 0
+            self._drop_all(f"the {frame.radar} radar's numbering restarted", losses)
         return True
 
     def _gap(self, lane: _Lane, radar: RadarId, number: int, t_ns: int, losses: list[Loss]) -> None:
@@ -157,6 +183,11 @@ class FramePairer:
         while len(self._lanes[radar].waiting) > self._depth:
             self._drop_oldest(radar, f"the other radar is more than {self._depth} frames behind", losses)
         return pairs
+
+    def _drop_all(self, detail: str, losses: list[Loss]) -> None:
+        for radar, lane in self._lanes.items():
+            while lane.waiting:
+                self._drop_oldest(radar, detail, losses)
 
     def _drop_oldest(self, radar: RadarId, detail: str, losses: list[Loss]) -> None:
         lane = self._lanes[radar]

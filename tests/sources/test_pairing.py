@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from hypothesis import strategies as st
 
 from edge.errors import CaptureError
 from edge.frames import RADARS, Layout, LossCause, RadarFrame, RadarId
+from edge.sources import pairing
 from edge.sources.base import Loss
-from edge.sources.pairing import FramePair, FramePairer
+from edge.sources.pairing import MAX_GAP_FRAMES, REFUSED_NUMBERS, FramePair, FramePairer
 
 LAYOUT = Layout("dca1000", 1, 1, 1, 2, 1)
 ADC = np.zeros(LAYOUT.shape, np.int16)
@@ -134,6 +136,73 @@ def test_losses_of_the_source_count_in_and_lost_and_unpair_the_partner() -> None
     assert pairer.ledgers["vertical"].snapshot().lost == {LossCause.TRUNCATED: 1}
 
 
+@pytest.mark.parametrize("absurd", [2**62, 10 + MAX_GAP_FRAMES])
+def test_one_absurd_number_costs_one_frame(absurd: int) -> None:
+    pairer = FramePairer(RADARS)
+    items: list[RadarFrame | Loss] = []
+    for n in range(20):
+        t_ns = n * PERIOD_NS
+        items += [frame("horizontal", absurd if n == 10 else n, t_ns), frame("vertical", n, t_ns + 1)]
+    pairs, losses = play(pairer, items)
+    assert [p.number for p in pairs] == [n for n in range(20) if n != 10]
+    assert [(x.radar, x.cause, x.count) for x in losses] == [
+        ("horizontal", LossCause.BACKWARDS_TIME, 1),
+        ("horizontal", LossCause.GAP, 1),
+        ("vertical", LossCause.UNPAIRED, 1),
+    ]
+    settle(pairer, pairs)
+    assert pairer.ledgers["horizontal"].snapshot().frames_in == 21
+
+
+def test_ten_minutes_without_frames_are_a_gap_and_more_a_new_numbering() -> None:
+    pairer = FramePairer(["horizontal"])
+    far = 2 * MAX_GAP_FRAMES + 1
+    numbers = [0, MAX_GAP_FRAMES, *range(far, far + REFUSED_NUMBERS + 5)]
+    pairs, losses = play(pairer, [frame("horizontal", n) for n in numbers])
+    assert [p.number for p in pairs] == [0, MAX_GAP_FRAMES, *range(far + REFUSED_NUMBERS, far + REFUSED_NUMBERS + 5)]
+    assert [(x.cause, x.count) for x in losses] == [
+        (LossCause.GAP, MAX_GAP_FRAMES - 1),
+        *[(LossCause.BACKWARDS_TIME, 1)] * REFUSED_NUMBERS,
+    ]
+    settle(pairer, pairs)
+
+
+def test_after_a_reboot_of_both_boards_pairs_come_again() -> None:
+    pairer, start = FramePairer(RADARS), 5000
+    numbers = [*range(start, start + 100), *range(start)]
+    items: list[RadarFrame | Loss] = []
+    for k, n in enumerate(numbers[: 100 + 2 * REFUSED_NUMBERS]):
+        t_ns = k * PERIOD_NS
+        items += [frame("horizontal", n, t_ns), frame("vertical", n, t_ns + PERIOD_NS // 2)]
+    pairs, losses = play(pairer, items)
+    after = range(REFUSED_NUMBERS, 2 * REFUSED_NUMBERS)
+    assert [p.number for p in pairs] == [*range(start, start + 100), *after]
+    assert Counter((x.radar, x.cause) for x in losses) == dict.fromkeys(
+        [(radar, LossCause.BACKWARDS_TIME) for radar in RADARS], REFUSED_NUMBERS
+    )
+    settle(pairer, pairs)
+
+
+def test_after_a_reboot_nothing_old_is_paired_with_a_new_frame_of_its_number() -> None:
+    pairer = FramePairer(RADARS)
+    old = [frame("horizontal", n) for n in (3, 4)]
+    repeated = [frame("horizontal", 0, 9 * PERIOD_NS)] * REFUSED_NUMBERS
+    pairs, losses = play(pairer, [*old, *repeated, frame("horizontal", 3, 10 * PERIOD_NS), frame("vertical", 3)])
+    (pair,) = pairs
+    assert pair.t_ns == 10 * PERIOD_NS
+    assert [x.number for x in losses if x.cause is LossCause.UNPAIRED] == [3, 4]
+    settle(pairer, pairs)
+
+
+def test_a_loss_far_ahead_moves_nothing() -> None:
+    pairer = FramePairer(["horizontal"])
+    absurd = Loss("horizontal", 2**62, LossCause.TRUNCATED, "", 0, 2)
+    pairs, losses = play(pairer, [frame("horizontal", 0), absurd, frame("horizontal", 1)])
+    assert [p.number for p in pairs] == [0, 1]
+    assert losses == [absurd]
+    settle(pairer, pairs)
+
+
 def test_foreign_radar_is_refused() -> None:
     with pytest.raises(CaptureError, match="does not have"):
         FramePairer(["horizontal"]).add(frame("vertical", 0))
@@ -143,31 +212,37 @@ def test_foreign_radar_is_refused() -> None:
 
 @st.composite
 def disturbed(draw: st.DrawFn) -> tuple[int, list[RadarFrame | Loss]]:
-    """Two streams with drops, doubles, swaps, wrong times and losses of the source, interleaved anyhow."""
+    """Two streams with drops, doubles, swaps, wrong times and numbers, reboots and losses, interleaved anyhow."""
     streams: dict[RadarId, list[RadarFrame | Loss]] = {}
     for radar in RADARS:
         stream: list[RadarFrame | Loss] = []
         for number in range(draw(st.integers(0, 12))):
-            fate = draw(st.sampled_from(["keep", "keep", "keep", "drop", "double", "swap", "loss", "early"]))
+            fate = draw(st.sampled_from(["keep", "keep", "keep", "drop", "double", "swap", "loss", "early", "absurd"]))
             if fate == "loss":
                 stream.append(Loss(radar, number, LossCause.TRUNCATED, "", 0, draw(st.integers(1, 3))))
             elif fate != "drop":
                 stream.append(frame(radar, number, -number if fate == "early" else None))
+                if fate == "absurd":
+                    stream.append(frame(radar, draw(st.sampled_from([2**62, number + MAX_GAP_FRAMES + 13]))))
                 if fate == "double":
                     stream.append(frame(radar, number))
                 if fate == "swap" and len(stream) > 1:
                     stream[-1], stream[-2] = stream[-2], stream[-1]
         streams[radar] = stream
+        if draw(st.booleans()):
+            reboot_ns = 20 * PERIOD_NS
+            stream += [frame(radar, n, reboot_ns + n * PERIOD_NS) for n in range(draw(st.integers(0, 12)))]
     order = draw(st.permutations([r for r in RADARS for _ in streams[r]]))
     iterators = {radar: iter(stream) for radar, stream in streams.items()}
     return draw(st.integers(1, 6)), [next(iterators[radar]) for radar in order]
 
 
-@given(disturbed())
-def test_every_frame_leaves_exactly_once(case: tuple[int, list[RadarFrame | Loss]]) -> None:
+@given(disturbed(), st.sampled_from([1, 3, 100]))
+def test_every_frame_leaves_exactly_once(case: tuple[int, list[RadarFrame | Loss]], refused: int) -> None:
     depth, items = case
     pairer = FramePairer(RADARS, depth=depth)
-    pairs, losses = play(pairer, items)
+    with mock.patch.object(pairing, "REFUSED_NUMBERS", refused):
+        pairs, losses = play(pairer, items)
     for radar in RADARS:
         arrived = [x for x in items if isinstance(x, RadarFrame) and x.radar == radar]
         reported = [x for x in items if isinstance(x, Loss) and x.radar == radar]
@@ -185,7 +260,7 @@ def test_every_frame_leaves_exactly_once(case: tuple[int, list[RadarFrame | Loss
         assert snapshot.frames_in == len(arrived) + lost[LossCause.TRUNCATED] + lost[LossCause.GAP]
         assert snapshot.pending == len(paired)
     numbers = [p.number for p in pairs]
-    assert numbers == sorted(set(numbers))
+    assert refused < 100 or numbers == sorted(set(numbers)), "ascending while the numbering is not restarted"
     assert all(p.horizontal and p.vertical and p.horizontal.number == p.vertical.number == p.number for p in pairs)
     settle(pairer, pairs)
 
