@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from edge.rig import Rig
 
 NS_PER_S = 1_000_000_000
-SIDELOBE_BINS = 1.5
-"""Main lobes of a range window are +-2 bins wide; sidelobes in angle are local maxima near their ridge."""
+SIDELOBE_BINS = 1.0
+"""Sidelobes in angle are local maxima on the ridge of the reflector's range, off it by a third of a bin in noise."""
 RANGE_SIGMAS = 3.0
 """The range gate in standard deviations of the range difference (rule "optimal")."""
 CANDIDATES = 16384

@@ -11,7 +11,7 @@ import numpy as np
 from edge.config import AntennaSettings, AssociationSettings, Mounting
 from edge.frames import Detections, Float64
 
-SIDELOBE_BINS = 1.5
+SIDELOBE_BINS = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +176,20 @@ def located(h: Seen, v: Seen, a: Float64, b: Float64) -> Float64 | None:
     return np.array([0.5 * (a[0] + math.sqrt(squares[0]) + b[0] + math.sqrt(squares[1])), y, z])
 
 
-def assigned(
+def values(
     seen: list[Seen], a: Float64, b: Float64, region: Region, range_bin_m: float, settings: AssociationSettings
-) -> list[tuple[Seen, Seen]]:
-    """Rule "optimal": the worthiest one-to-one assignment of the pairs within the gate that are points to keep."""
+) -> tuple[list[Seen], list[Seen], Float64]:
+    """What every pair is worth: 0 beyond the range gate and for what is no point to keep.
+
+    Args:
+        seen: detections of both radars.
+        a, b: [3], phase centres of the horizontal and the vertical board.
+        region: what is kept.
+        range_bin_m: of both radars.
+        settings: gate, level scale.
+    Returns:
+        Horizontal detections, vertical ones, float64 [horizontal, vertical].
+    """
     horizontal, vertical = [s for s in seen if s.horizontal], [s for s in seen if not s.horizontal]
     gate_m = settings.range_gate_bins * range_bin_m
     value = np.zeros((len(horizontal), len(vertical)))
@@ -187,7 +197,28 @@ def assigned(
         for j, v in enumerate(vertical):
             if abs(h.common_m - v.common_m) <= gate_m and region.holds(located(h, v, a, b)):
                 value[i, j] = worth(h, v, gate_m / 3.0, settings.level_scale_db)
-    return [(horizontal[i], vertical[j]) for i, j in worthiest(value)]
+    return horizontal, vertical, value
+
+
+def gathered(
+    horizontal: Detections,
+    vertical: Detections,
+    velocity_rig_m_s: Float64,
+    mountings: tuple[Mounting, Mounting],
+    range_bin_m: float,
+    settings: AssociationSettings,
+    antenna: AntennaSettings,
+) -> tuple[list[Seen], Float64, Float64]:
+    """Detections of both radars in order of range, both phase centres at the horizontal burst; see ``associate``."""
+    delay_s = (vertical.t_first_chirp_ns - horizontal.t_first_chirp_ns) * 1e-9
+    a = np.array(mountings[0].position_m)
+    b = np.array(mountings[1].position_m) + np.asarray(velocity_rig_m_s) * delay_s
+    origin = np.array([0.5 * (a[0] + b[0]), b[1], a[2]])
+    seen = []
+    for detections, board, mounting in ((horizontal, a, mountings[0]), (vertical, b, mountings[1])):
+        seen += described(detections, board, origin, mounting.power_offset_db, antenna, settings, range_bin_m)
+    seen.sort(key=lambda s: (s.common_m, s.level_db, not s.horizontal, s.index))
+    return seen, a, b
 
 
 def associate(
@@ -215,25 +246,19 @@ def associate(
         float64 [n, 6]: x, y, z, power dB, horizontal range, vertical range; nearest first (paper: strongest first
         inside a range bin).
     """
-    delay_s = (vertical.t_first_chirp_ns - horizontal.t_first_chirp_ns) * 1e-9
-    a = np.array(mountings[0].position_m)
-    b = np.array(mountings[1].position_m) + np.asarray(velocity_rig_m_s) * delay_s
-    origin = np.array([0.5 * (a[0] + b[0]), b[1], a[2]])
-    seen = []
-    for detections, board, mounting in ((horizontal, a, mountings[0]), (vertical, b, mountings[1])):
-        seen += described(detections, board, origin, mounting.power_offset_db, antenna, settings, range_bin_m)
-    seen.sort(key=lambda s: (s.common_m, s.level_db, not s.horizontal, s.index))
+    seen, a, b = gathered(horizontal, vertical, velocity_rig_m_s, mountings, range_bin_m, settings, antenna)
     region = Region(up, height_m, settings.ground_margin_m, settings.max_height_m)
     if settings.rule == "paper":
         bins = range_bins(seen, settings.range_gate_bins * range_bin_m)
         pairs = [pair for members in bins for pair in paired(members, settings.max_discrepancy_db)]
     else:
-        pairs = assigned(seen, a, b, region, range_bin_m, settings)
-    rows = []
+        rows, columns, value = values(seen, a, b, region, range_bin_m, settings)
+        pairs = [(rows[i], columns[j]) for i, j in worthiest(value)]
+    points = []
     for h, v in pairs:
         xyz = located(h, v, a, b)
         if xyz is None or not region.holds(xyz):
             continue
         compensated = (h.power_db + 2 * loss_db(v.cosine, antenna), v.power_db + 2 * loss_db(h.cosine, antenna))
-        rows.append([*xyz.tolist(), 0.5 * sum(compensated), h.range_m, v.range_m])
-    return np.array(rows, dtype=np.float64).reshape(-1, 6)
+        points.append([*xyz.tolist(), 0.5 * sum(compensated), h.range_m, v.range_m])
+    return np.array(points, dtype=np.float64).reshape(-1, 6)
