@@ -32,6 +32,8 @@ class CaptureMean:
         saturated_share: share of all I and Q codes at the rails.
         dead: bool [slots, receivers], channels that gave one constant value in a whole frame.
         history: complex128 [frame, loop, slots, receivers], spectrum of every loop at the range that was watched.
+        first_profile: float64 [PADDING * sample], range profile of the first frame, its loops added incoherently: it
+            shows a reflector that moves.
     """
 
     samples: Complex128
@@ -40,6 +42,7 @@ class CaptureMean:
     saturated_share: float
     dead: NDArray[np.bool_]
     history: Complex128
+    first_profile: Float64
 
 
 class CaptureAverager:
@@ -61,6 +64,7 @@ class CaptureAverager:
         self._history: list[Complex128] = []
         self._rails = 0
         self._watch: Complex128 | None = None
+        self._profile = np.zeros(0)
 
     @property
     def frames(self) -> int:
@@ -84,7 +88,8 @@ class CaptureAverager:
         samples = unpack(frame.adc, self._layout)
         self._dead |= (samples == samples[..., :1]).all(axis=(0, 3))
         if self._watch is None:
-            self._watch = self._phasor_of_strongest(samples)
+            self._profile = range_profile(samples[:: -(-len(samples) // MOST_LOOPS)], self._taper)
+            self._watch = self._phasor_of_strongest()
         self._history.append(samples @ self._watch)
         self._sum += samples.mean(axis=0)
 
@@ -100,14 +105,14 @@ class CaptureAverager:
         return CaptureMean(
             *(self._sum / self.frames, self.frames, self._layout.loops, self._rails / codes, self._dead),
             np.stack(self._history),
+            self._profile,
         )
 
-    def _phasor_of_strongest(self, samples: Complex128) -> Complex128:
-        """Windowed DFT phasor of the range with the most power, loops added incoherently: it may be moving."""
-        power = range_profile(samples[:: -(-len(samples) // MOST_LOOPS)], self._taper)
+    def _phasor_of_strongest(self) -> Complex128:
+        """Windowed DFT phasor of the searched range with the most power."""
         first, last = (round(PADDING * edge) for edge in self._search)
-        here = np.clip(np.arange(first, last + 1), 0, len(power) - 1)
-        return phasor(np.array(here[power[here].argmax()] / PADDING), self._taper)
+        here = np.clip(np.arange(first, last + 1), 0, len(self._profile) - 1)
+        return phasor(np.array(here[self._profile[here].argmax()] / PADDING), self._taper)
 
 
 def range_taper(samples: int) -> Float64:

@@ -31,9 +31,11 @@ NEAREST_APERTURES = 10.0
 POWER_ITERATIONS = 8
 COMB_LEAST_TEETH = 6
 COMB_LEAST_SHARE = 0.85
-COMB_PROMINENCE_DB = 10.0
+COMB_PROMINENCE_DB = 8.0
 COMB_SHORTEST_BINS = 8.0
-COMB_TOLERANCE_BINS = 0.75
+COMB_TOLERANCE_BINS = 0.25
+COMB_STEP_BINS = 0.02
+COMB_GRID = 32
 ANCHORS = 8
 REPAIRABLE_SHARE_OF_A_ROW = 0.5
 
@@ -225,37 +227,54 @@ def image_rejection_db(profile: Float64) -> float:
     return float(10.0 * np.log10(profile[edge:half].sum() / profile[half:-edge].sum()))
 
 
-def comb_period_bins(level_db: Float64, anchor: int) -> float:
-    """Period of a comb of peaks one of which is ``anchor``; 0 when there is none.
+def comb_period_bins(level_db: Float64, anchor_bin: float) -> float:
+    """Period of a comb of peaks through ``anchor_bin``; 0 when there is none.
+
+    Nearly every place of a comb must hold a peak within a quarter of a bin; echoes of a scene do not stand so.
 
     Args:
         level_db: range profile, PADDING points a bin.
-        anchor: index of a peak.
+        anchor_bin: position of a peak.
+    Returns:
+        The period with the largest share of its places filled, of equals the shortest.
     """
-    reach, tolerance = round(PADDING * COMB_SHORTEST_BINS), round(PADDING * COMB_TOLERANCE_BINS)
-    padded = np.pad(level_db, reach, mode="reflect")
-    around = np.lib.stride_tricks.sliding_window_view(padded[:: PADDING // 4], 2 * reach // (PADDING // 4) + 1)
-    floor = np.repeat(np.median(around, axis=1), PADDING // 4)[: len(level_db)]
-    near = np.lib.stride_tricks.sliding_window_view(np.pad(level_db, tolerance, mode="edge"), 2 * tolerance + 1)
-    tooth = near.max(axis=1) - floor >= COMB_PROMINENCE_DB
-    first, last = PADDING * LEAKAGE_BINS, len(level_db) - PADDING * LEAKAGE_BINS
-    for period in range(reach, (last - first) // COMB_LEAST_TEETH + 1):
-        before = np.arange(anchor - period, first - 1, -period)
-        teeth = np.concatenate((before, np.arange(anchor + period, last, period)))
-        hits = int(tooth[teeth].sum())
-        if hits >= COMB_LEAST_TEETH and hits >= COMB_LEAST_SHARE * len(teeth):
-            return period / PADDING
-    return 0.0
+    first, last = float(LEAKAGE_BINS), len(level_db) / PADDING - LEAKAGE_BINS
+    filled = np.zeros(round(COMB_GRID * (last + 1)), dtype=np.bool_)
+    for peak in _prominent_bins(level_db):
+        low, high = peak - COMB_TOLERANCE_BINS, peak + COMB_TOLERANCE_BINS
+        filled[max(0, round(COMB_GRID * low)) : round(COMB_GRID * high) + 1] = True
+    best, best_share = 0.0, 0.0
+    for period in np.arange(COMB_SHORTEST_BINS, (last - first) / COMB_LEAST_TEETH, COMB_STEP_BINS):
+        places = np.concatenate((np.arange(anchor_bin - period, first, -period), np.arange(anchor_bin, last, period)))
+        hits = int(np.count_nonzero(filled[np.rint(COMB_GRID * places).astype(np.int64)]))
+        share = hits / max(len(places), 1)
+        if hits >= COMB_LEAST_TEETH and share >= COMB_LEAST_SHARE and share > best_share:
+            best, best_share = float(period), share
+    return best
+
+
+def _prominent_bins(level_db: Float64) -> list[float]:
+    """Positions of the peaks that stand out of the median of their surroundings."""
+    reach, coarse = round(PADDING * COMB_SHORTEST_BINS), PADDING // 4
+    padded = np.pad(level_db, reach, mode="reflect")[::coarse]
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach // coarse + 1)
+    floor = np.repeat(np.median(around, axis=1), coarse)[: len(level_db)]
+    inner = np.arange(1, len(level_db) - 1)
+    peak = (level_db[inner] >= level_db[inner - 1]) & (level_db[inner] > level_db[inner + 1])
+    peak &= level_db[inner] - floor[inner] >= COMB_PROMINENCE_DB
+    return [_vertex(level_db, int(index)) for index in inner[peak]]
 
 
 def _require_no_comb(level_db: Float64, reflector: int) -> None:
-    strongest = _window_peaks(level_db, len(level_db) / (2 * PADDING), len(level_db) / (2 * PADDING) - LEAKAGE_BINS)
-    for anchor in (reflector, *strongest[:ANCHORS].tolist()):
-        period = comb_period_bins(level_db, anchor)
+    bins = len(level_db) / PADDING
+    strongest = _window_peaks(level_db, bins / 2, bins / 2 - LEAKAGE_BINS)[:ANCHORS]
+    for anchor in (reflector, *strongest.tolist()):
+        position = _vertex(level_db, anchor)
+        period = comb_period_bins(level_db, position)
         if period:
             raise CalibrationError(
                 "the capture is full of spurs: its range profile is a comb",
-                value=f"a peak every {period:.1f} bins, one of them at bin {anchor / PADDING:.1f}",
+                value=f"a peak every {period:.1f} bins, one of them at bin {position:.1f}",
                 allowed="echoes at irregular ranges",
                 action="find what disturbs the board (supply, other radar, cables) and capture again",
             )

@@ -119,9 +119,9 @@ def make_calibration(
     schedule = radar.schedule
     require_possible_range(radar, reflector.range_m, reflector.search_m)
     require_samples(mean, schedule)
-    turn_rad = require_still(mean, schedule.profile.wavelength_m)
-    samples = mean.samples if background is None else mean.samples - background.samples
     taper, bin_m = range_taper(schedule.profile.samples), schedule.profile.range_bin_m
+    turn_rad = _turn_rad(mean, reflector, bin_m, schedule.profile.wavelength_m)
+    samples = mean.samples - (0.0 if background is None else background.samples)
     profile = range_profile(samples[~mean.dead], taper)
     peak = find_reflector(profile, reflector.range_m / bin_m, reflector.search_m / bin_m)
     path_m = _two_way_path_m(radar, reflector)
@@ -149,16 +149,20 @@ def make_calibration(
         repaired=repaired,
     )
     calibration = Calibration(
-        _scaled(gain, amplitude),
-        shift,
-        reference_range_m=reflector.range_m,
-        board=board,
-        temperature_c=temperature_c,
-        date=date.today().isoformat(),
+        *(_scaled(gain, amplitude), shift, reflector.range_m, board, temperature_c, date.today().isoformat()),
         made_with=Waveform.of(schedule),
         repaired=repaired,
     )
     return MadeCalibration(calibration, quality, profile, peak, level_db, residual)
+
+
+def _turn_rad(mean: CaptureMean, reflector: Reflector, bin_m: float, wavelength_m: float) -> float:
+    """``require_still``, but noise in place of a reflector is called so, and not a moving one."""
+    try:
+        return require_still(mean, wavelength_m)
+    except CalibrationError:
+        find_reflector(mean.first_profile, reflector.range_m / bin_m, reflector.search_m / bin_m)
+        raise
 
 
 def _measure(

@@ -30,7 +30,7 @@ class Quality:
     Args:
         frames, loops: averaged.
         snr_db: reflector over the floor of the range profile (clutter and noise), a channel.
-        margin_db: over the next echo of the search window; None: there is none.
+        margin_db: over the next echo of the search window (the window's own sidelobes are 31 dB down); None: none.
         separability_rms_deg: phases against transmitter plus receiver, repaired channels left out: coupling, other
             echoes of this range and noise.
         repeatability_rms_deg: phases of the capture's first half against its second half; None: one loop.

@@ -133,7 +133,7 @@ def align(rig: Rig, stops: Sequence[Stop], survey_sigma_m: float = DEFAULT_SURVE
             _refuse(stops, free, sigma, bad)
         break
     estimates = tuple(Estimate(n, float(v), float(s)) for n, v, s in zip(free, value, sigma, strict=True))
-    offset_db, error_db = _power_offset_db(rig, stops)
+    offset_db, error_db = _power_offset_db(rig, stops, problem.places_m)
     return Alignment(
         *(_corrected(rig, estimates, offset_db), estimates, tuple(held), offset_db, error_db, rms, len(stops), surveyed)
     )
@@ -171,7 +171,7 @@ class _Problem:
         if all(stop.survey_m is not None for stop in stops):
             self._survey = np.array([stop.survey_m for stop in stops], dtype=np.float64)
         self._survey_sigma_m = survey_sigma_m
-        self._start = self._closed_form()
+        self._start = self.places_m = self._closed_form()
 
     def _closed_form(self) -> Float64:
         """Places [stop, 3] from horizontal range and both cosines, with the rig's mounting."""
@@ -196,6 +196,7 @@ class _Problem:
             unknown = unknown + change
             if np.abs(change).max() < 1e-9:
                 break
+        self.places_m = unknown[len(names) :].reshape(-1, 3)
         residual = self._residual(unknown, names)
         freedom = max(len(residual) - len(unknown), 1)
         rms = math.sqrt(float(residual @ residual) / freedom)
@@ -226,18 +227,18 @@ def _array_axis(radar: RadarId, value: dict[str, float]) -> Float64:
     return np.asarray(axis / np.linalg.norm(axis))
 
 
-def _power_offset_db(rig: Rig, stops: Sequence[Stop]) -> tuple[float, float]:
-    """Offset of the vertical board that makes both boards' levels equal on average, and its standard error."""
-    loss = rig.settings.antenna
-    difference = np.array(
-        [
-            stop.horizontal.power_db
-            + 2.0 * across_loss_db(loss, stop.vertical.cosine)
-            - stop.vertical.power_db
-            - 2.0 * across_loss_db(loss, stop.horizontal.cosine)
-            for stop in stops
-        ]
-    )
+def _power_offset_db(rig: Rig, stops: Sequence[Stop], places_m: Float64) -> tuple[float, float]:
+    """Offset of the vertical board that makes both boards' levels equal on average, and its standard error.
+
+    The gain across each array is taken in the direction in which that board sees the place: it falls so steeply that
+    the distance of the boards matters.
+    """
+    level_db = []
+    for radar, across in zip(RADARS, (2, 1), strict=True):
+        sight = places_m - np.asarray(rig.radars[radar].mounting.position_m)
+        loss_db = across_loss_db(rig.settings.antenna, sight[:, across] / np.linalg.norm(sight, axis=1))
+        level_db.append(np.array([getattr(stop, radar).power_db for stop in stops]) + 2.0 * loss_db)
+    difference = level_db[0] - level_db[1]
     own = np.array([math.hypot(stop.horizontal.power_sigma_db, stop.vertical.power_sigma_db) for stop in stops])
     spread = max(float(difference.std(ddof=1)), float(np.sqrt(np.mean(own**2))))
     offset = rig.radars["horizontal"].mounting.power_offset_db + float(difference.mean())
