@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 from edge.errors import ConfigError
@@ -328,6 +327,3 @@ class RigGeometry:
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.8)
-
-
-CalibrationPath = Path | None

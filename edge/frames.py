@@ -32,6 +32,8 @@ RadarId = Literal["horizontal", "vertical"]
 RADARS: tuple[RadarId, RadarId] = ("horizontal", "vertical")
 
 QUATERNION_NORM_TOLERANCE = 1e-3
+FULL_WINDOW_FRAMES = 60
+"""Frames from which on a window counts as full (one second at 60 frames/s): confidence, flag of the stream."""
 
 
 class LossCause(StrEnum):
@@ -50,7 +52,7 @@ class LossCause(StrEnum):
     NO_POSE = "no_pose"
     """No pose at the frame's instant: outside the recorded poses or inside a pose gap."""
     BACKWARDS_TIME = "backwards_time"
-    """Time stamp not later than that of the frame before."""
+    """Time stamp or number out of order: not later than that of the frame before, or a number absurdly far ahead."""
     OVERFLOW = "overflow"
     """A queue was full and the oldest frame was dropped."""
     GAP = "gap"
@@ -351,6 +353,7 @@ class Shape:
         input: the object the shape was made from.
         model: first 16 hex digits of the model file's SHA-256.
         latency_us: stage name -> microseconds spent.
+        seen_points: points of ``input`` that the network saw after thinning; None: all.
     """
 
     identity: int
@@ -362,3 +365,9 @@ class Shape:
     input: ObjectCloud
     model: str
     latency_us: dict[str, int] = field(default_factory=dict)
+    seen_points: int | None = None
+
+    @property
+    def input_points(self) -> int:
+        """Points that the shape was made from."""
+        return len(self.input) if self.seen_points is None else self.seen_points

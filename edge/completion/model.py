@@ -19,13 +19,11 @@ from edge.completion.manifest import Manifest, read_files, read_manifest
 from edge.completion.sight import bearing_rad, turned
 from edge.config import CompletionSettings
 from edge.errors import ConfigError, ModelError
-from edge.frames import Float32, ObjectCloud, Shape
+from edge.frames import FULL_WINDOW_FRAMES, Float32, ObjectCloud, Shape
 
 UNKNOWN = "unknown"
 STAGE = "nn"
 """Name of this stage in ``Shape.latency_us``."""
-FULL_WINDOW_FRAMES = 60
-"""Frames of a window from which on its confidence is not lowered (one second at 60 frames/s)."""
 ENOUGH_POINTS = 256
 """Input points from which on the confidence is not lowered: 60 held-out clouds thinned to 64, 128, 256 and 768 points
 were completed to a mean Chamfer distance of 18.5, 16.0, 13.8 and 13.9 cm."""
@@ -139,6 +137,7 @@ class CompletionModel:
             input=cloud,
             model=self.identifier,
             latency_us={STAGE: (time.perf_counter_ns() - started_ns) // 1000},
+            seen_points=len(points),
         )
 
     def run(self, points_m: Float32) -> tuple[Float32, Float32, Float32]:

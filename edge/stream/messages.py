@@ -59,8 +59,8 @@ class ShapeMessage:
         class_probability: class name -> probability.
         confidence: 0..1.
         pose: object frame in the odometry frame.
-        size_m: float64 [3], extent of the shape along x, y, z of the object frame.
-        input_points: points that the shape was made from.
+        size_m: float64 [3], extent along x, y, z of the object frame, from the 1 % to the 99 % quantile of the points.
+        input_points: points that the network saw; ``input_m`` may hold more.
         frames: frames of the window.
         t_start_ns, t_end_ns: first and last frame of the window.
         travel_m: travel inside the window.

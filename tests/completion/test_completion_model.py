@@ -124,7 +124,10 @@ def test_too_many_points_are_thinned_and_never_repeated(model: CompletionModel, 
     model.run = lambda points_m: seen.append(points_m) or run(points_m)  # type: ignore[method-assign,func-returns-value]
     try:
         for points in (many, many, many[:2048], golden):
-            model.complete(cloud(points, sensor_m=points.mean(axis=0, dtype=np.float64) - [8.0, 0.0, 0.0]))
+            done = model.complete(cloud(points, sensor_m=points.mean(axis=0, dtype=np.float64) - [8.0, 0.0, 0.0]))
+            assert done is not None
+            assert done.input_points == min(len(points), 2048)
+            assert len(done.input) == len(points)
     finally:
         del model.run
     assert len(seen[0]) == len(np.unique(seen[0], axis=0)) == 2048

@@ -20,6 +20,7 @@ from stream_samples import (
     detections,
     fused_cloud,
     heatmap,
+    object_cloud,
     point_cloud,
     pose,
     shape,
@@ -91,6 +92,28 @@ def test_shape_comes_back() -> None:
     assert (header.boot, header.sequence, header.t_ns) == (BOOT, 7, 1_000_000_000)
     assert (header.t_pub_ns, header.utc_ns, header.utc_ok) == (1_000_500_000, 1_800_000_000_000_000_000, True)
     assert (header.source, header.config_hash, header.calibration_hash) == ("sim", b"configur", b"calibrat")
+
+
+def test_stray_points_do_not_enlarge_a_shape_and_only_seen_points_count() -> None:
+    points = np.zeros((16384, 3), np.float32)
+    points[:, 0], points[:, 1] = np.linspace(-2, 2, 16384), 0.25
+    points[:8] = [[9, -9, 9]] * 4 + [[-9, 9, -9]] * 4
+    stray = replace(shape(), fine_m=points, input=object_cloud(3000), seen_points=2048)
+    message = sent(convert.encode_shape(stray))
+    assert isinstance(message, ShapeMessage)
+    np.testing.assert_allclose(message.size_m, [0.98 * 4, 0.0, 0.0], atol=2e-3)
+    assert message.input_m is not None
+    assert (message.input_points, len(message.input_m)) == (2048, 3000)
+
+
+def test_frame_numbers_beyond_32_bits_are_refused_not_wrapped() -> None:
+    numbers = fused_cloud().frame_number
+    largest = sent(convert.encode_cloud(replace(fused_cloud(), frame_number=numbers + (2**32 - 1 - numbers.max()))))
+    assert isinstance(largest, CloudMessage)
+    assert largest.cloud.frame_number.max() == 2**32 - 1
+    for shift in (2**32, -1):
+        with pytest.raises(WireError, match="frame number"):
+            convert.encode_cloud(replace(fused_cloud(), frame_number=numbers + shift))
 
 
 def test_cloud_comes_back() -> None:
