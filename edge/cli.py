@@ -22,7 +22,7 @@ VERBS = {
     "replay": "play a recording through the whole pipeline and publish what comes out",
     "listen": "print what a running pipeline publishes",
     "import": "turn a TI capture into a recording, or a TI calibration into ours",
-    "calibrate": "make a calibration from a corner-reflector capture; align two boards from several stops of it",
+    "calibrate": "make a calibration from a corner-reflector capture; align two boards",
     "info": "describe a recording, a rig or a model; rigs with every hardware rule",
     "doctor": "check this machine; --warm compiles the kernels before the first start",
     "bench": "time every stage beside a named peer in the same process",
