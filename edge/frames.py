@@ -151,8 +151,9 @@ class PointResponse:
         focus_inverse_m: 1 / (2 range) whose curvature is compensated everywhere; negative: each range has its own.
         range_correlation, angle_correlation: complex128 [range], [angle], correlation of the noise of two bins by
             their distance (edge/dsp/effective_cells.py); None: bins are independent.
-        range_envelope, angle_envelope: float64 [range], [angle], largest amplitude of a point at this distance in bins
-            or farther (edge/dsp/tables.py); None: unknown.
+        range_envelope, angle_envelope: float64 [range], [level, angle], largest amplitude of a point about this
+            distance in bins away from its peak (edge/dsp/tables.py); level: what focusing leaves of the wavefront's
+            curvature, |(1 - u^2) / (2 r) - focus|, in steps of 0.01 / m; None: unknown.
         range_spread_bins: half the spread of the row's ranges to a target at direction cosine 1.
     """
 
@@ -170,6 +171,27 @@ class PointResponse:
 
 
 @dataclass(frozen=True, slots=True)
+class DopplerMaps:
+    """Range-angle power of every Doppler bin of one burst.
+
+    Args:
+        power: float32 [Doppler, angle, range], as in Heatmap; the imager's buffer.
+        fold: int8 [Doppler, range], multiple of ``interval_m_s`` plus ``most_folds``.
+        speed_m_s: float64 [Doppler], radial speed of each bin without folds, positive away, ascending.
+        interval_m_s: speeds that differ by this look alike from loop to loop.
+        most_folds: largest multiple of the interval.
+        delay_s: middle of the burst after its first chirp.
+    """
+
+    power: Float32
+    fold: NDArray[np.int8]
+    speed_m_s: Float64
+    interval_m_s: float
+    most_folds: int
+    delay_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Heatmap:
     """Range-angle power of one radar.
 
@@ -181,6 +203,9 @@ class Heatmap:
         direction_cosine: float32 [angle], uniform over one period, ascending, -1/(2 pitch) .. +1/(2 pitch).
         range_m: float32 [range], from the phase centre of the array.
         response: how a point target appears; None: unknown, detections are interpolated by plain parabolas.
+        doppler: maps whose largest value ``power`` holds; None: Doppler was not kept.
+        range_drift_m: float32 [angle], what the rig's motion up to the middle of the burst took off a static point's
+            range; None: nothing that counts.
     """
 
     radar: RadarId
@@ -190,6 +215,8 @@ class Heatmap:
     direction_cosine: Float32
     range_m: Float32
     response: PointResponse | None = None
+    doppler: DopplerMaps | None = None
+    range_drift_m: Float32 | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,14 +33,18 @@ class FrameReport:
     """What was noticed while a frame was processed.
 
     Args:
-        loops: loops that were summed.
-        saturated_share: share of the summed I and Q codes at the rails.
+        loops: loops that were used.
+        saturated_share: share of the used I and Q codes at the rails.
         dead: names of channels that gave one constant value: "RX5" (with every transmitter), "TX3" or "TX3 RX5".
+        choice: what became of the loops: "sum", "steer", "fft" or "single".
+        reason: why, for people.
     """
 
     loops: int = 0
     saturated_share: float = 0.0
     dead: tuple[str, ...] = ()
+    choice: str = ""
+    reason: str = ""
 
 
 def reject_all_zero(frame: RadarFrame) -> FrameRejected:

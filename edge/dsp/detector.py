@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import CfarSettings, require
+from edge.dsp.doppler import finish
 from edge.dsp.interpolation import PARABOLA
 from edge.dsp.kernels_cfar import (
     mean_decisions,
@@ -18,7 +19,7 @@ from edge.dsp.kernels_cfar import (
     ring_halves_kernel,
     ring_mean_kernel,
 )
-from edge.dsp.kernels_detect import refine, strongest
+from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
 from edge.dsp.ring_tables import RingTables
 from edge.frames import Detections, Float32, Heatmap, PointResponse
 
@@ -44,13 +45,19 @@ class Detector:
         self.radar, self.settings = radar.radar, settings
         self.cut = 0
         """Detections of the last frame that were left out beyond ``max_detections``."""
+        self.sidelobes = 0
+        """Detections of the last frame that were left out as sidelobes of stronger ones."""
         self._ring = (settings.guard_angle, settings.train_angle, settings.guard_range, settings.train_range)
         self._shape = (0, 0)
+        self._bounds: tuple[Float32, ...] | None = None
         self._ends_m = (np.nan, np.nan)
         self._response: PointResponse | None = None
-        self._axes = np.zeros(7)
+        self._axes = np.zeros(8)
+        self._margin = 10.0 ** (0.1 * settings.sidelobe_margin_db)
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
         self._index = np.zeros(settings.max_detections, dtype=np.int64)
+        self._received = np.zeros(settings.max_detections, dtype=np.float32)
+        self._places = np.zeros((4, settings.max_detections), dtype=np.int64)
         self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
         if settings.kind == "os":
             self._rank_peaks = rank_peaks_kernel(*self._ring)
@@ -74,9 +81,11 @@ class Detector:
         count = self._find(heatmap.power)
         kept = strongest(heatmap.power, self._cells, count, self.settings.max_detections, self._value, self._index)
         self.cut = count - kept
+        kept = self._keep_reflectors(heatmap, kept)
         self._refine(heatmap, kept)
         columns = self._columns[:, :kept].copy()
-        doppler = np.full(kept, np.nan, dtype=np.float32)
+        cells, ranges = self._cells[self._index[:kept]], heatmap.power.shape[1]
+        doppler = finish(heatmap, cells // ranges, cells % ranges, columns[0])
         return Detections(
             *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, columns[0], columns[1], columns[2]),
             *(doppler, columns[3]),
@@ -109,8 +118,12 @@ class Detector:
         return self._noise
 
     def _prepare(self, heatmap: Heatmap) -> None:
-        """Buffers and tables, made again only when the axes change."""
-        range_m = heatmap.range_m
+        """Axes; buffers and tables are made again only when they change."""
+        range_m, cosine = heatmap.range_m, heatmap.direction_cosine
+        last = len(range_m) - 1
+        self._axes[0], self._axes[1] = range_m[0], (float(range_m[last]) - float(range_m[0])) / last
+        self._axes[2] = cosine[0]
+        self._axes[3] = (float(cosine[-1]) - float(cosine[0])) / (len(cosine) - 1)
         ends_m = (float(range_m[0]), float(range_m[-1]))
         if heatmap.power.shape == self._shape and ends_m == self._ends_m:
             return
@@ -131,7 +144,7 @@ class Detector:
         self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
         self._pattern = np.ones(angles, dtype=np.float32)
         self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, None
-        self._axes[4:] = 0.0
+        self._axes[4:], self._bounds = 0.0, None
         self._shape, self._ends_m = (angles, ranges), ends_m
 
     def _look_up(self, response: PointResponse | None) -> None:
@@ -140,12 +153,33 @@ class Detector:
             return
         self._pattern[:] = 1.0
         self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, response
-        self._axes[4:] = 0.0
+        self._axes[4:], self._bounds = 0.0, None
         if response is not None:
             np.divide(1.0, response.gain, out=self._pattern)
             self._range_fit, self._angle_fit = response.range_fit, response.angle_fit
-            self._axes[4:] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
+            self._axes[4:7] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
+            self._axes[7] = response.range_spread_bins
+            self._look_up_sidelobes(response)
         self._tables = RingTables.of(self.settings, self._shape[1], self._first, response)
+
+    def _look_up_sidelobes(self, response: PointResponse) -> None:
+        """Bounds of a point's power by distance in bins; off without them."""
+        self._bounds = None
+        if self.settings.sidelobe_guard and response.range_envelope is not None and response.angle_envelope is not None:
+            envelopes = response.range_envelope, response.angle_envelope
+            self._bounds = tuple(np.square(envelope).astype(np.float32) for envelope in envelopes)
+
+    def _keep_reflectors(self, heatmap: Heatmap, count: int) -> int:
+        """Close the gaps that sidelobes leave in ``_index``; returns what is left of ``count`` peaks."""
+        self.sidelobes = 0
+        if self._bounds is None:
+            return count
+        kept = drop_sidelobes(
+            *(heatmap.power, self._pattern, self._cells, self._index, count, self._axes, self._margin),
+            *(*self._bounds, self._received, self._places),
+        )
+        self.sidelobes = count - int(kept)
+        return int(kept)
 
     def _estimate(self, power: Float32) -> None:
         tables = self._tables
@@ -170,11 +204,6 @@ class Detector:
         return int(found)
 
     def _refine(self, heatmap: Heatmap, count: int) -> None:
-        range_m, cosine = heatmap.range_m, heatmap.direction_cosine
-        last = len(range_m) - 1
-        self._axes[0], self._axes[1] = range_m[0], (float(range_m[last]) - float(range_m[0])) / last
-        self._axes[2] = cosine[0]
-        self._axes[3] = (float(cosine[-1]) - float(cosine[0])) / (len(cosine) - 1)
         refine(
             *(heatmap.power, self._pattern, self._cells, self._index, self._estimates, count),
             *(self._range_fit, self._angle_fit, self._axes, self._columns),

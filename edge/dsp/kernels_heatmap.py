@@ -293,14 +293,26 @@ def _pruned_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # 
                 work[x + 3 * q], work[x + 3 * q + im] = yr * w3r - yi * w3i, yr * w3i + yi * w3r
 
 
+@njit(inline="always")
+def _whole_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # type: ignore[no-untyped-def]
+    """Load a chunk of a row of any number of elements up to the FFT's length and do the first stage."""
+    for e in range(4 * quarter):
+        keep, source = float32(e < elements), min(e, elements - 1)
+        for l in range(lanes):  # noqa: E741
+            work[e * lanes + l] = row[0, source, column + l] * keep
+            work[e * lanes + l + im] = row[1, source, column + l] * keep
+    _narrow_stage(work, twiddle, 0, 1, quarter, lanes, im)
+
+
 @cache
-def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
+def angle_kernel(bins: int, points: int, lanes: int = 16, whole: bool = False) -> Callable[..., Any]:
     """Compile the kernel from the virtual row's range spectra to power over direction cosine and range.
 
     Args:
         bins: length of the angle FFT, a power of two, 64..4096, at least twice the elements.
         points: range bins.
         lanes: range bins per vector.
+        whole: the row may have as many elements as the FFT is long; costs a full first stage.
     Returns:
         kernel(row [2, element, points], twiddle, target int64 [bins], gain [bins], first, last, work [2 * bins *
         lanes], power [bins, points]); row ``target[i]`` of ``power`` receives FFT row i times ``gain[target[i]]`` when
@@ -315,7 +327,10 @@ def angle_kernel(bins: int, points: int, lanes: int = 16) -> Callable[..., Any]:
     @njit(signature, **OPTIONS)
     def kernel(row, twiddle, target, gain, first, last, work, power):  # type: ignore[no-untyped-def]
         for column in range(0, points, lanes):
-            _pruned_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
+            if whole:
+                _whole_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
+            else:
+                _pruned_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)
             _narrow_stage(work, twiddle, 2 * (bins - bins // 4), 4, bins // 16, lanes, im)
             if bins >= 128:
                 _narrow_stage(work, twiddle, 2 * (bins - bins // 16), 16, bins // 64, lanes, im)

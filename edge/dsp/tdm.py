@@ -8,10 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.config import DopplerChoice
 from edge.frames import Complex64, Float64, RadarId
 
 COHERENT_SHARE = 0.4
 """Largest radial speed of a coherent sum, as a share of the first null lambda / (2 slots L Tc)."""
+LEAST_FFT_LOOPS = 4
+"""Fewer loops tell no speeds apart."""
 FOV_COSINE = math.sqrt(0.5)
 """Cosine and sine of the field of view's edge, 45 degrees."""
 
@@ -35,6 +38,14 @@ def radial_speed_in_fov_m_s(velocity_rig_m_s: Float64) -> float:
     return math.hypot(forward, across)
 
 
+def closing_range_m_s(forward_m_s: float, along_m_s: float) -> tuple[float, float]:
+    """Smallest and largest v_x sqrt(1 - u^2) + v_along u over the field of view, 45 degrees to both sides."""
+    ends = [FOV_COSINE * (forward_m_s + along_m_s), FOV_COSINE * (forward_m_s - along_m_s)]
+    if abs(along_m_s) < abs(forward_m_s):
+        ends.append(math.copysign(math.hypot(forward_m_s, along_m_s), forward_m_s))
+    return min(ends), max(ends)
+
+
 def coherent_loops(radial_speed_m_s: float, wavelength_m: float, loop_time_s: float, most: int) -> int:
     """Loops that may be summed: v <= 0.4 lambda / (2 L loop_time), at least 1, at most ``most``.
 
@@ -47,6 +58,45 @@ def coherent_loops(radial_speed_m_s: float, wavelength_m: float, loop_time_s: fl
     if radial_speed_m_s * most * 2.0 * loop_time_s <= COHERENT_SHARE * wavelength_m:
         return most
     return max(1, int(COHERENT_SHARE * wavelength_m / (2.0 * loop_time_s * radial_speed_m_s)))
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What becomes of a burst's loops.
+
+    Args:
+        name: "sum", "steer", "fft" or "single".
+        loops: loops used.
+        reason: why, for people.
+    """
+
+    name: DopplerChoice
+    loops: int
+    reason: str
+
+
+def choose(wish: DopplerChoice, most: int, coherent: int, steerable: int, speed_m_s: float | None) -> Choice:
+    """What becomes of the loops; coherent sums only where they cannot cancel.
+
+    Args:
+        wish: the setting.
+        most: loops that were captured or asked for.
+        coherent: loops whose plain sum cannot cancel at this speed (``coherent_loops``).
+        steerable: loops that odometry can steer: a point stays in its range bin, the moved row within the angle FFT.
+        speed_m_s: largest radial speed of a static point; None: not known.
+    """
+    at = "no velocity given, taken as standing still" if speed_m_s is None else f"at {speed_m_s:.2f} m/s"
+    if most == 1 or wish == "single":
+        return Choice("single", 1, "one loop in use" if most == 1 else "heatmap.doppler asks for one loop")
+    if wish == "fft":
+        return Choice("fft", most, "heatmap.doppler asks for it")
+    if wish == "sum" or coherent >= most:
+        return Choice("sum", coherent, f"{at}: {coherent} of {most} loops add up without cancelling")
+    if wish == "steer" or steerable > coherent:
+        return Choice("steer", steerable, f"{at}: {coherent} of {most} loops add up as they are, {steerable} steered")
+    if most >= LEAST_FFT_LOOPS:
+        return Choice("fft", most, f"{at}: too fast to steer more than {steerable} of {most} loops")
+    return Choice("sum", coherent, f"{at}: too fast to steer, {coherent} of {most} loops add up")
 
 
 def speed_phasors(radial_speed_m_s: float, transmit_time_s: Float64, wavelength_m: float) -> Complex64:

@@ -52,7 +52,7 @@ def test_saturation_is_counted_exactly_and_refused_beyond_the_limit(rail):
     adc = frame.adc.copy()
     adc[1, 0, 3, :50, 2, 0] = rail
     imager.process(dataclasses.replace(frame, adc=adc))
-    assert imager.last_report.saturated_share == pytest.approx(50 / (2 * 9 * 16 * 256), rel=1e-6)
+    assert imager.last_report.saturated_share == pytest.approx(50 / (2 * 12 * 16 * 256), rel=1e-6)
     adc[:, :, 3] = rail
     adc[:, :, 3, 0] = 5
     with pytest.raises(FrameRejected, match="saturated") as refusal:
@@ -65,7 +65,7 @@ def test_saturation_of_a_single_chip_is_counted():
     adc = frame.adc.copy()
     adc[0, 0, 1, :8] = 32767
     imager.process(dataclasses.replace(frame, adc=adc))
-    assert imager.last_report.saturated_share == pytest.approx(32 / (2 * 2 * 4 * 256), rel=1e-6)
+    assert imager.last_report.saturated_share == pytest.approx(32 / (2 * 3 * 4 * 256), rel=1e-6)
 
 
 def test_clipped_target_is_refused_by_default():

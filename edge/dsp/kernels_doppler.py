@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels over loops: channels in order, moved elements spread on the row's grid, Doppler FFT, folds, strongest bin.
+
+A channel is one (slot, receiver) of the row. ``cube`` holds the channels' focused range spectra, [channel, loop,
+(re, im), range]; range innermost, so that every inner loop runs along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numba import complex64, float32, float64, int8, int64, njit, types, uint64
+
+OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+
+TAPS = 6
+"""Grid cells that one moved element is spread on."""
+SPREAD_SHAPE = 12.0
+"""b of the spreading function exp(b (sqrt(1 - (2 x / W)^2) - 1)), Barnett et al. 2019, for W = TAPS."""
+FRACTIONS = 2048
+"""Places within a cell at which the spreading function is known."""
+FINE = 8
+"""Density is kept at 1 / FINE of an element."""
+ROUNDS = 3
+"""Rounds of the weights' iteration (Pipe and Menon 1999)."""
+
+
+@cache
+def channel_kernel(points: int, rx: int) -> Callable[..., Any]:
+    """Compile the kernel that focuses one loop's spectra and puts each channel's range bins in order.
+
+    Args:
+        points: range bins.
+        rx: receivers of one device.
+    Returns:
+        kernel(spectra [block, 2 * points * rx], focus [block, 2, points * rx], rows int64 [points], channel int64
+        [block, rx], work [2 * points * rx], loop, cube [channel, loop, 2, points]); channel -1 is left out.
+    """
+    im = points * rx
+    signature = types.void(
+        *(float32[:, ::1], float32[:, :, ::1], int64[::1], int64[:, ::1], float32[::1]),
+        *(int64, float32[:, :, :, ::1]),
+    )
+
+    @njit(signature, **OPTIONS)
+    def kernel(spectra, focus, rows, channel, work, loop, cube):  # type: ignore[no-untyped-def]
+        for b in range(len(channel)):
+            spectrum = spectra[b]
+            for x in range(im):
+                fr, fi = focus[b, 0, x], focus[b, 1, x]
+                re, i = spectrum[x], spectrum[x + im]
+                work[x] = re * fr - i * fi
+                work[x + im] = re * fi + i * fr
+            for r in range(rx):
+                c = channel[b, r]
+                if c < 0:
+                    continue
+                for k in range(points):
+                    x = uint64(rows[k] + r)
+                    cube[c, loop, 0, k] = work[x]
+                    cube[c, loop, 1, k] = work[x + uint64(im)]
+
+    return kernel
+
+
+@njit(inline="always")
+def _smooth(fine, kernel, begin, end, out):  # type: ignore[no-untyped-def]
+    """``out`` = ``fine`` convolved with the symmetric ``kernel`` of odd length, from ``begin`` to before ``end``."""
+    first = uint64(begin - len(kernel) // 2)
+    for x in range(end - begin):
+        out[uint64(begin) + uint64(x)] = 0.0
+    for j in range(len(kernel)):
+        share = kernel[j]
+        for x in range(end - begin):
+            out[uint64(begin) + uint64(x)] += share * fine[first + uint64(j) + uint64(x)]
+
+
+@njit(
+    types.void(
+        *(float64[::1], int64[::1], float64[:, ::1], float64, float64, int64),
+        *(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], float64[::1], int64[:, ::1]),
+        float32[:, :, ::1],
+    ),
+    **OPTIONS,
+)
+def plan_spreading(position, slot, time, drift, middle, loops, density, taper, shape, fine, weight, first, taps):  # type: ignore[no-untyped-def]
+    """Where every element stands by the time of its chirp, and its weight, spread on the grid of the row.
+
+    Element n of loop l stands at position + drift t. Weights are the inverse density of elements, by the iteration
+    w <- w / (w * density)(x), times the taper over the moved aperture; they sum to 1.
+
+    Args:
+        position: float64 [channel], in elements from the row's middle.
+        slot: int64 [channel].
+        time: float64 [loop, slot], from the burst's middle.
+        drift: elements per second.
+        middle: grid cell of position 0.
+        loops: loops used.
+        density: float64 [odd], what counts as near, at FINE points an element.
+        taper: float64 [m], window over the aperture, m points in equal steps from edge to edge.
+        shape: float64 [fractions, TAPS], spreading function by the element's fraction of a cell.
+        fine: float64 [2, FINE * cells + margins] scratch.
+        weight: float64 [loop * channel] scratch.
+        first: int64 [loop, channel], receives the first of TAPS cells.
+        taps: float32 [loop, channel, TAPS], receives the shares.
+    """
+    channels = len(position)
+    lowest, highest = 1e9, -1e9
+    for l in range(loops):  # noqa: E741
+        for c in range(channels):
+            x = position[c] + drift * time[l, slot[c]]
+            lowest, highest = min(lowest, x), max(highest, x)
+            weight[l * channels + c] = 1.0
+    offset = middle * FINE + len(density) // 2
+    begin, end = int(lowest * FINE + offset), int(highest * FINE + offset) + 2
+    for _ in range(ROUNDS):
+        fine[0] = 0.0
+        for n in range(loops * channels):
+            x = (position[n % channels] + drift * time[n // channels, slot[n % channels]]) * FINE + offset
+            cell = int(x)
+            fine[0, cell] += weight[n] * (1.0 - (x - cell))
+            fine[0, cell + 1] += weight[n] * (x - cell)
+        _smooth(fine[0], density, begin, end, fine[1])
+        for n in range(loops * channels):
+            x = (position[n % channels] + drift * time[n // channels, slot[n % channels]]) * FINE + offset
+            cell = int(x)
+            weight[n] /= fine[1, cell] * (1.0 - (x - cell)) + fine[1, cell + 1] * (x - cell)
+    total = 0.0
+    for n in range(loops * channels):
+        x = position[n % channels] + drift * time[n // channels, slot[n % channels]]
+        weight[n] *= taper[int((x - lowest + 0.5) / (highest - lowest + 1.0) * len(taper))]
+        total += weight[n]
+    for n in range(loops * channels):
+        l, c = n // channels, n % channels  # noqa: E741
+        x = position[c] + drift * time[l, slot[c]] + middle
+        cell = int(x) - (TAPS // 2 - 1)
+        first[l, c] = cell
+        fraction = int((x - int(x)) * len(shape))
+        for j in range(TAPS):
+            taps[l, c, j] = weight[n] / total * shape[fraction, j]
+
+
+@njit(types.void(complex64[:, ::1], float64[:, ::1], float64, float64), **OPTIONS)
+def set_turns(turn, time, closing_m_s, wavelength_m):  # type: ignore[no-untyped-def]
+    """exp(j 4 pi c t / lambda): what undoes the closing speed c; turn, time [loop, slot]."""
+    for l in range(turn.shape[0]):  # noqa: E741
+        for s in range(turn.shape[1]):
+            angle = 4.0 * np.pi * closing_m_s * time[l, s] / wavelength_m
+            turn[l, s] = complex(np.cos(angle), np.sin(angle))
+
+
+@njit(
+    types.void(
+        *(float32[:, :, :, ::1], int64[::1], int64, complex64[:, ::1], int64[:, ::1], float32[:, :, ::1]),
+        *(float32[:, ::1], float32[:, :, ::1]),
+    ),
+    **OPTIONS,
+)
+def spread(cube, slot, loops, turn, first, taps, line, row):  # type: ignore[no-untyped-def]
+    """Turn every channel of every loop and add it to its cells of the grid.
+
+    Args:
+        cube: [channel, loop, (re, im), range].
+        slot: int64 [channel].
+        loops: loops used.
+        turn: complex64 [loop, slot].
+        first, taps: as ``plan_spreading`` makes them.
+        line: float32 [2, range] scratch.
+        row: float32 [(re, im), cell, range], overwritten.
+    """
+    points = cube.shape[3]
+    row[:] = float32(0)
+    for c in range(len(slot)):
+        for l in range(loops):  # noqa: E741
+            tr, ti = turn[l, slot[c]].real, turn[l, slot[c]].imag
+            for k in range(points):
+                re, i = cube[c, l, 0, k], cube[c, l, 1, k]
+                line[0, k] = re * tr - i * ti
+                line[1, k] = re * ti + i * tr
+            for j in range(TAPS):
+                cell, tap = uint64(first[l, c] + j), taps[l, c, j]
+                for k in range(points):
+                    row[0, cell, k] += tap * line[0, k]
+                    row[1, cell, k] += tap * line[1, k]
+
+
+@njit(types.void(float32[:, :, :, ::1], float32[:, ::1]), **OPTIONS)
+def doppler_fft(cube, twiddle):  # type: ignore[no-untyped-def]
+    """FFT over loops in place, radix 2, decimation in frequency: bin k stands where its bits are reversed.
+
+    Args:
+        cube: [channel, loop, (re, im), range], loops a power of two.
+        twiddle: float32 [(re, im), loops / 2], exp(-j 2 pi n / loops).
+    """
+    channels, loops, _, points = cube.shape
+    for c in range(channels):
+        half = loops // 2
+        while half >= 1:
+            step = loops // (2 * half)
+            for start in range(0, loops, 2 * half):
+                for n in range(half):
+                    wr, wi = twiddle[0, n * step], twiddle[1, n * step]
+                    upper, lower = uint64(start + n), uint64(start + n + half)
+                    for k in range(points):
+                        ar, ai = cube[c, upper, 0, k], cube[c, upper, 1, k]
+                        br, bi = cube[c, lower, 0, k], cube[c, lower, 1, k]
+                        dr, di = ar - br, ai - bi
+                        cube[c, upper, 0, k] = ar + br
+                        cube[c, upper, 1, k] = ai + bi
+                        cube[c, lower, 0, k] = dr * wr - di * wi
+                        cube[c, lower, 1, k] = dr * wi + di * wr
+            half //= 2
+
+
+@njit(
+    types.void(
+        *(
+            float32[:, :, :, ::1],
+            int64,
+            int64[:, ::1],
+            int64,
+            complex64[:, ::1],
+            float32[:, :, ::1],
+            float32[::1],
+            int8[::1],
+        ),
+    ),
+    **OPTIONS,
+)
+def resolve_folds(cube, d, pairs, distances, hypothesis, work, score, fold):  # type: ignore[no-untyped-def]
+    """Which multiple of the ambiguous speed the doubled elements agree with, range bin by range bin.
+
+    sum over pairs of late conj(early), grouped by their distance d in slots, has the phase 2 pi f d, f the Doppler
+    phase from slot to slot in turns; the hypothesis with the largest real part of the turned sum wins.
+
+    Args:
+        cube: [channel, Doppler, (re, im), range].
+        d: place of the Doppler bin.
+        pairs: int64 [pair, 3], earlier channel, later channel, index of the slot distance.
+        distances: different slot distances.
+        hypothesis: complex64 [fold, distance], exp(-j 2 pi f d).
+        work: float32 [distance, (re, im), range] scratch.
+        score: float32 [range] scratch.
+        fold: int8 [range], receives the index of the hypothesis.
+    """
+    points, bin_ = cube.shape[3], uint64(d)
+    work[:] = float32(0)
+    for n in range(len(pairs)):
+        a, b, g = uint64(pairs[n, 0]), uint64(pairs[n, 1]), uint64(pairs[n, 2])
+        for k in range(points):
+            ar, ai, br, bi = cube[a, bin_, 0, k], cube[a, bin_, 1, k], cube[b, bin_, 0, k], cube[b, bin_, 1, k]
+            work[g, 0, k] += br * ar + bi * ai
+            work[g, 1, k] += bi * ar - br * ai
+    for k in range(points):
+        score[k] = float32(-1e30)
+    for m in range(len(hypothesis)):
+        for k in range(points):
+            value = float32(0)
+            for g in range(distances):
+                value += work[g, 0, k] * hypothesis[m, g].real - work[g, 1, k] * hypothesis[m, g].imag
+            if value > score[k]:
+                score[k] = value
+                fold[k] = m
+
+
+@njit(
+    types.void(
+        *(float32[:, :, :, ::1], int64, int64[::1], int64[::1], float32[:, :, ::1], int8[::1]),
+        *(float32[:, :, ::1], float32[:, :, ::1]),
+    ),
+    **OPTIONS,
+)
+def doppler_row(cube, d, slot, element, turns, fold, turn, row):  # type: ignore[no-untyped-def]
+    """Undo one Doppler bin's phase between slots and fill the virtual row.
+
+    Args:
+        cube: [channel, Doppler, (re, im), range].
+        d: place of the Doppler bin.
+        slot, element: int64 [channel].
+        turns: float32 [fold, slot, (re, im)].
+        fold: int8 [range], index of the hypothesis.
+        turn: float32 [slot, (re, im), range] scratch.
+        row: [(re, im), element, range], overwritten.
+    """
+    points, bin_ = cube.shape[3], uint64(d)
+    for s in range(turn.shape[0]):
+        for k in range(points):
+            turn[s, 0, k] = turns[fold[k], s, 0]
+            turn[s, 1, k] = turns[fold[k], s, 1]
+    row[:] = float32(0)
+    for c in range(len(slot)):
+        e, s = uint64(element[c]), uint64(slot[c])
+        for k in range(points):
+            re, i, tr, ti = cube[c, bin_, 0, k], cube[c, bin_, 1, k], turn[s, 0, k], turn[s, 1, k]
+            row[0, e, k] += re * tr - i * ti
+            row[1, e, k] += re * ti + i * tr
+
+
+@njit(types.void(float32[:, :, ::1], float32[:, ::1]), **OPTIONS)
+def strongest_bin(maps, power):  # type: ignore[no-untyped-def]
+    """Largest of all Doppler bins; maps [Doppler, angle, range], power [angle, range] is overwritten."""
+    bins, angles, points = maps.shape
+    for a in range(angles):
+        for k in range(points):
+            power[a, k] = maps[0, a, k]
+        for d in range(1, bins):
+            for k in range(points):
+                power[a, k] = max(power[a, k], maps[d, a, k])
