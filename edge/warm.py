@@ -10,10 +10,9 @@ import numpy as np
 from edge.frames import Pose, RadarFrame, RadarId
 from edge.pipeline import Pipeline
 from edge.rig import Rig
+from edge.warm_frames import noise_frames
 
 FRAMES = 3
-CODES = 64
-"""Size of the noise, in ADC codes."""
 P_FA = 0.05
 """Enough false alarms to have detections, pairs and points."""
 
@@ -44,13 +43,3 @@ def warm_up(rig: Rig, pipeline: Pipeline | None = None) -> dict[str, float]:
     if pipeline is not None:
         pipeline.rehearse(frames)
     return {stage: time.max_us / 1e3 for stage, time in own.times.summary().items()}
-
-
-def noise_frames(rig: Rig, number: int, t_ns: int) -> dict[RadarId, RadarFrame]:
-    """One frame of uniform noise for every radar of the rig, the same for the same number."""
-    rng = np.random.default_rng(number)
-    layouts = {radar: board.schedule.layout for radar, board in rig.radars.items()}
-    return {
-        radar: RadarFrame(radar, number, t_ns, rng.integers(-CODES, CODES, layout.shape, dtype=np.int16), layout)
-        for radar, layout in layouts.items()
-    }

@@ -54,8 +54,8 @@ def test_the_key_follows_the_contents_of_shared_files_version_and_processor(
 
 def test_the_real_package_has_shared_kernels_and_numba_uses_the_folder(environment: Path) -> None:
     program = (
-        "import os; from edge.fusion import kernels_association as k; from numba import config;"
-        "print(k.sort._cache._cache_path); print(config.CACHE_DIR)"
+        "from edge.dsp import kernels_checks as k; from numba import config;"
+        "print(k.all_zero._cache._cache_path); print(config.CACHE_DIR)"
     )
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from cli_run import rfconstruct
 
+import edge.warm  # noqa: F401  compiles into this process's cache before a test hides it
 from edge import numba_cache
 from edge.commands import doctor_command
 from edge.config import StreamSettings
