@@ -10,6 +10,8 @@ from numba import float32, float64, int64, njit, types
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 LARGEST_PARABOLA = 0.5
+DEFOCUS_STEP_PER_M = 0.01
+"""As in edge/dsp/tables.py."""
 
 
 @njit(inline="always")
@@ -55,6 +57,77 @@ def strongest(power, cells, count, most, value, index):  # type: ignore[no-untyp
         index[0], index[end] = index[end], index[0]
         _sink(value, index, 0, end)
     return size
+
+
+@njit(inline="always")
+def _is_explained(value, place, count, n, margin, most, range_bound, angle_bound):  # type: ignore[no-untyped-def]
+    """Whether the sidelobes of one of ``count`` peaks bound peak n from above, see ``drop_sidelobes``."""
+    a, r = place[0, n], place[1, n]
+    for m in range(count):
+        if value[n] >= value[m] * most:
+            continue
+        away = max(abs(r - place[1, m]) - place[3, m], 0)
+        range_share, angle_share = range_bound[away], angle_bound[place[2, m], abs(a - place[0, m])]
+        within = range_share == float32(1) and angle_share == float32(1)
+        if not within and value[n] < margin * value[m] * range_share * angle_share:
+            return True
+    return False
+
+
+@njit(inline="always")
+def _defocus_level(range_m, cosine, focus_inverse_m, levels):  # type: ignore[no-untyped-def]
+    """Row of the angle bounds for a point at (range, cosine)."""
+    inverse = 0.5 / max(range_m, 0.05)
+    focused = focus_inverse_m if focus_inverse_m >= 0.0 else inverse
+    left = abs((1.0 - min(cosine * cosine, 1.0)) * inverse - focused)
+    return min(int64(np.ceil(left / DEFOCUS_STEP_PER_M)), levels - 1)
+
+
+SIDELOBE_ARGUMENTS = (float32[:, ::1], float32[::1], int64[::1], int64[::1], int64, float64[::1], float32)
+
+
+@njit(int64(*SIDELOBE_ARGUMENTS, float32[::1], float32[:, ::1], float32[::1], int64[:, ::1]), **OPTIONS)
+def drop_sidelobes(  # type: ignore[no-untyped-def]
+    power, pattern, cells, index, count, axes, margin, range_bound, angle_bound, value, place
+):
+    """Leave out peaks that the windows' sidelobes of another peak explain.
+
+    Peak n goes when some peak m has P_n < margin P_m B_r(dr) B_a(da), powers as received. Within the main lobe of both
+    axes nothing goes: what is there is a matter of resolution.
+
+    Args:
+        power, pattern: [A, R], [A].
+        cells: peak n is cell ``cells[index[n]]``.
+        index: int64, keeps its order and closes its gaps.
+        count: peaks.
+        axes: as in ``refine``.
+        margin: power ratio.
+        range_bound, angle_bound: float32 [R], [level, A], bound of a point's power by distance in bins, 1 in the main
+            lobe; the levels are those of the curvature that focusing leaves (edge/dsp/tables.py).
+        value: float32 [count or more], work space for the received powers.
+        place: int64 [4, count or more], work space for row, column, level and spread of every peak.
+    Returns:
+        Peaks kept.
+    """
+    ranges = power.shape[1]
+    most = float32(0)
+    for share in range_bound:
+        most = max(most, share * margin if share < float32(1) else float32(0))
+    for level in angle_bound:
+        for share in level:
+            most = max(most, share * margin if share < float32(1) else float32(0))
+    for n in range(count):
+        a, r = cells[index[n]] // ranges, cells[index[n]] % ranges
+        place[0, n], place[1, n] = a, r
+        value[n], cosine = power[a, r] * pattern[a], axes[2] + a * axes[3]
+        place[2, n] = _defocus_level(axes[0] + r * axes[1], cosine, axes[6], len(angle_bound))
+        place[3, n] = int64(np.ceil(axes[7] * min(abs(cosine), 1.0)))
+    kept = 0
+    for n in range(count):
+        if not _is_explained(value, place, count, n, margin, most, range_bound, angle_bound):
+            index[kept] = index[n]
+            kept += 1
+    return kept
 
 
 @njit(inline="always")
@@ -116,8 +189,8 @@ def refine(power, pattern, cells, index, estimate, count, range_fit, angle_fit, 
         estimate: received noise power, by place in ``cells``.
         count: peaks.
         range_fit, angle_fit: [10], coefficients of the axes.
-        axes: float64 [7]: range of bin 0, range bin, cosine of row 0, cosine step, range_bias_m2, cosine_bias_m,
-            focus_inverse_m.
+        axes: float64 [8]: range of bin 0, range bin, cosine of row 0, cosine step, range_bias_m2, cosine_bias_m,
+            focus_inverse_m, spread (of ``drop_sidelobes``).
         out: float32 [4, count or more], receives range m, direction cosine, power dB, SNR dB.
     """
     angles, ranges = power.shape

@@ -15,6 +15,8 @@ Int64 = NDArray[np.int64]
 Complex128 = NDArray[np.complex128]
 ENVELOPE_STEPS = 16
 """Points a bin at which a response is searched for its sidelobes."""
+DEFOCUS_STEP_PER_M, DEFOCUS_LEVELS = 0.01, 32
+"""Left-over curvature up to 0.31 / m: a point at 0.8 m and 45 degrees."""
 
 
 def taper(settings: HeatmapSettings, axis: Literal["range", "angle"], count: int, centre: float) -> Float64:
@@ -58,26 +60,68 @@ def taylor_coefficients(nbar: int, sidelobe_db: float) -> Float64:
     return np.asarray(-0.5 * (-1.0) ** i * np.prod(1.0 - m2 / zeros, axis=1) / np.prod(others, axis=1))
 
 
-def response_envelope(taper: Float64, bins: int) -> Float64:
+def response_envelope(taper: Float64 | Complex128, bins: int, null: float = 0.0) -> Float64:
     """Bound of a point's amplitude in a bin, relative to its peak bin, by the distance between the two bins.
 
-    The point stands anywhere within its peak bin, so that a distance of d bins is at least d - 1/2 in truth; the bound
-    is the largest response from there on. It is 1 within the main lobe: what is there is a matter of resolution.
+    The point stands anywhere within its peak bin; the bound is the largest response beyond the main lobe within 3/2
+    bins of the distance, which reaches the top of the nearest sidelobe. It is 1 within the main lobe: what is there is
+    a matter of resolution.
 
     Args:
-        taper: [n] before the FFT.
+        taper: [n] before the FFT; complex with the phases that focusing leaves.
+        bins: FFT length.
+        null: distance at which the main lobe ends, ``main_lobe`` of the flawless taper; 0: of this one.
+    Returns:
+        float64 [bins], periodic: distances d and bins - d are the same.
+    """
+    steps = ENVELOPE_STEPS
+    response = np.abs(np.fft.fft(taper, steps * bins))
+    response /= response.max()
+    either = np.maximum(response, np.roll(response[::-1], 1))
+    null = null or main_lobe(np.abs(taper), bins)
+    middle, either = either[steps // 2], np.where(_distance(len(either)) < null * steps, 0.0, either)
+    top = either.copy()
+    for shift in range(1, 3 * steps // 2 + 1):
+        np.maximum(top, np.maximum(np.roll(either, shift), np.roll(either, -shift)), out=top)
+    distance = _distance(bins)
+    return np.where(distance <= null, 1.0, np.minimum(top[steps * distance] / middle, 1.0))
+
+
+def _distance(bins: int) -> Int64:
+    """Distance of every bin from bin 0 on a periodic axis."""
+    return np.minimum(np.arange(bins), bins - np.arange(bins))
+
+
+def defocused_envelopes(weight: Float64, element: Int64, curvature_m: Float64, taper: Float64, bins: int) -> Float64:
+    """Bounds in angle of a point whose wavefront's curvature focusing leaves in part.
+
+    The two-way path of channel c of a point at (r, u) has q_c (1 - u^2) / (2 r) too much, q_c = a^2 + b^2; where it is
+    focused for a point at boresight, q_c x is left with x = -u^2 / (2 r). Steps of q_c from one transmitter to the next
+    raise sidelobes far from the peak, its bend those beside it.
+
+    Args:
+        weight: [slots, receivers] of every channel; element: int64, its place in the row, -1: none.
+        curvature_m: [slots, receivers] q_c over the wavelength, without its mean and its slope along the row.
+        taper: [elements], the row's.
         bins: FFT length.
     Returns:
-        float64 [bins], periodic: distance d and bins - d are the same.
+        float64 [levels, bins], as ``response_envelope``, for |x| = level * DEFOCUS_STEP_PER_M.
     """
-    response = np.abs(np.fft.fft(taper, ENVELOPE_STEPS * bins))[: ENVELOPE_STEPS * bins // 2 + 1]
-    response /= response[0]
+    null, inside, rows = main_lobe(taper, bins), element >= 0, []
+    for level in range(DEFOCUS_LEVELS):
+        channel = weight * np.exp(2j * np.pi * curvature_m * level * DEFOCUS_STEP_PER_M)
+        row = np.zeros(len(taper), dtype=np.complex128)
+        np.add.at(row, element[inside], channel[inside])
+        rows.append(response_envelope(row, bins, null))
+    return np.stack(rows)
+
+
+def main_lobe(taper: Float64, bins: int) -> float:
+    """Bins from the middle of a point's response to its first minimum."""
+    response = np.abs(np.fft.fft(taper, ENVELOPE_STEPS * bins))[: ENVELOPE_STEPS * bins // 2]
     rising = np.diff(response) > 0.0
-    null = int(np.argmax(rising)) if rising.any() else len(response) - 1
-    bound = np.maximum.accumulate(response[::-1])[::-1]
-    bound = np.where(np.arange(len(bound)) < null, 1.0, np.minimum(bound / response[ENVELOPE_STEPS // 2], 1.0))
-    distance = np.minimum(np.arange(bins), bins - np.arange(bins))
-    return np.asarray(bound[np.maximum(ENVELOPE_STEPS * distance - ENVELOPE_STEPS // 2, 0)])
+    null = int(np.argmax(rising)) if rising.any() else len(response)
+    return null / ENVELOPE_STEPS
 
 
 def next_power_of_two(count: int) -> int:

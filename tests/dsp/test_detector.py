@@ -11,6 +11,7 @@ from test_cfar import RADAR, heatmap
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
+from edge.dsp.kernels_detect import drop_sidelobes
 from edge.reference.point_targets import make_frame
 
 FLAT = AntennaSettings(along_loss_db=0.0)
@@ -133,3 +134,61 @@ def test_noise_scatters_the_estimates_as_little_as_the_theory_allows():
     assert spread[0] < 2e-3
     assert spread[1] < 0.1 / 131
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * spread / np.sqrt(40) + (1e-4, 1e-4))
+
+
+@pytest.mark.parametrize("window", ["rectangular", "hann", "taylor"])
+@pytest.mark.parametrize(("range_m", "angle_deg"), [(3.0, 0.0), (8.0, 0.2), (8.0, -20.0), (8.0, 40.0), (3.0, 40.0)])
+def test_a_lone_reflector_is_one_detection_down_to_the_rounding(window, range_m, angle_deg):
+    """Without noise the ordered statistic sees every sidelobe, those of the left-over wavefront curvature included."""
+    radar = cascade_radar()
+    imager = Imager(radar, HeatmapSettings(angle_window=window), FLAT)
+    heatmap_ = imager.process(make_frame(radar, [place(range_m, angle_deg)], 300.0, 0, 0))
+    detector = Detector(radar, CfarSettings(kind="os", p_fa=1e-5))
+    found = detector.process(heatmap_)
+    assert detector.sidelobes >= 10
+    assert (found.power_db > found.power_db[0] - 80.0).sum() == 1
+    bare = Detector(radar, CfarSettings(kind="os", p_fa=1e-5, sidelobe_guard=False))
+    assert len(bare.process(heatmap_)) == len(found) + detector.sidelobes
+
+
+@pytest.mark.parametrize(("apart_deg", "weaker_db"), [(3.0, 5.0), (3.5, 15.0), (4.0, 20.0), (5.0, 25.0), (10.0, 40.0)])
+def test_weaker_reflectors_beside_a_strong_one_are_kept(apart_deg, weaker_db):
+    radar = cascade_radar()
+    imager, detector = Imager(radar, HeatmapSettings(), FLAT), Detector(radar, CfarSettings(kind="os", p_fa=1e-5))
+    amplitudes = [300.0, 300.0 * 10 ** (-weaker_db / 20)]
+    found = detector.process(
+        imager.process(make_frame(radar, [place(6.0, 5.0), place(6.0, 5.0 + apart_deg)], amplitudes, 0, 0))
+    )
+    error = np.abs(found.direction_cosine - np.sin(np.radians(5.0 + apart_deg)))
+    assert error.min() < 0.7 / 131
+    assert found.power_db[error.argmin()] == pytest.approx(20 * np.log10(amplitudes[1]), abs=1.5)
+
+
+def test_sidelobes_are_left_out_as_the_definition_says():
+    """Random peaks and bounds against plain loops."""
+    rng = np.random.default_rng(6)
+    power = (10 ** rng.uniform(-6, 0, (32, 24))).astype(np.float32)
+    pattern = rng.uniform(0.2, 1.0, 32).astype(np.float32)
+    cells, index = rng.choice(32 * 24, 200, replace=False), rng.permutation(200)
+    range_bound = np.r_[1.0, 1.0, 10 ** rng.uniform(-5, -1, 22)].astype(np.float32)
+    angle_bound = np.c_[np.ones((3, 2)), 10 ** rng.uniform(-5, -1, (3, 30))].astype(np.float32)
+    axes = np.array([1.0, 0.1, -0.8, 0.05, 0.0, 0.0, -1.0, 2.0])
+    places = [divmod(int(c), 24) for c in cells[index]]
+    kept = []
+    for n, (a, r) in zip(index.tolist(), places, strict=True):
+        strongest_share = 0.0
+        for b, s in places:
+            u, range_m = -0.8 + 0.05 * b, 1.0 + 0.1 * s
+            level = min(int(np.ceil(u * u / (2 * range_m) / 0.01)), 2)
+            away = max(abs(r - s) - int(np.ceil(2 * abs(u))), 0)
+            share = range_bound[away] * angle_bound[level, abs(a - b)]
+            within = range_bound[away] == 1 and angle_bound[level, abs(a - b)] == 1
+            strongest_share = max(strongest_share, 0.0 if within else 2.0 * power[b, s] * pattern[b] * share)
+        if power[a, r] * pattern[a] >= strongest_share:
+            kept.append(n)
+    count = drop_sidelobes(
+        *(power, pattern, cells, index, 200, axes, np.float32(2.0), range_bound, angle_bound),
+        *(np.zeros(200, dtype=np.float32), np.zeros((4, 200), dtype=np.int64)),
+    )
+    assert 20 < count < 180
+    assert index[:count].tolist() == kept

@@ -106,3 +106,23 @@ def test_antenna_loss_is_quadratic_and_capped():
     assert along_loss_db(antenna, 0.0) == 0.0
     assert across_loss_db(antenna, np.sin(np.radians(20.0))) == pytest.approx(6.0)
     assert across_loss_db(antenna, [1.0, -2.0]).tolist() == [15.0, 15.0]
+
+
+@pytest.mark.parametrize(("nbar", "sidelobe_db"), [(4, 30.0), (5, 35.0), (8, 45.0)])
+def test_taylor_windows_are_scipys_and_keep_their_sidelobes(nbar, sidelobe_db):
+    windows = pytest.importorskip("scipy.signal.windows")
+    taper = tables.window("taylor", 86, 42.5, nbar, sidelobe_db)
+    np.testing.assert_allclose(taper, windows.taylor(86, nbar, sidelobe_db, norm=True), atol=1e-12)
+    response = np.abs(np.fft.fft(taper, 64 * 86)) / taper.sum()
+    beyond = response[int(64 * tables.main_lobe(taper, 86)) + 64 : 64 * 43]
+    assert 20 * np.log10(beyond.max()) == pytest.approx(-sidelobe_db, abs=1.0)
+
+
+@pytest.mark.parametrize(("name", "count", "bins"), [("hann", 256, 256), ("hann", 86, 256), ("taylor", 86, 256)])
+def test_no_bin_of_a_point_exceeds_its_envelope(name, count, bins):
+    taper, n = tables.window(name, count, (count - 1) / 2), np.arange(count)
+    envelope, distance = tables.response_envelope(taper, bins), np.minimum(np.arange(bins), bins - np.arange(bins))
+    beyond = distance >= tables.main_lobe(taper, bins) + 0.5
+    for offset in np.linspace(-0.5, 0.5, 21):
+        line = np.abs(np.fft.fft(taper * np.exp(2j * np.pi * n * offset / bins), bins))
+        assert np.all((line <= line[0] * envelope * (1 + 1e-9))[beyond])

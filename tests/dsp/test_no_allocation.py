@@ -16,7 +16,7 @@ from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.dsp.kernels_cfar import mean_peaks
 from edge.dsp.kernels_checks import all_zero, dead_channels
-from edge.dsp.kernels_detect import refine, strongest
+from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
 from edge.dsp.kernels_heatmap import set_phasors
 from edge.reference.point_targets import make_frame
 
@@ -58,6 +58,7 @@ def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(road
         imager._row_kernel,
         imager._angle_kernel,
         strongest,
+        drop_sidelobes,
         refine,
     ]
     kernels += [detector._rank_peaks] if detector.settings.kind == "os" else [detector._ring_noise, mean_peaks]
