@@ -13,10 +13,12 @@ from edge.errors import ConfigError
 
 WindowName = Literal["rectangular", "hann", "taylor"]
 CfarKind = Literal["ca", "go", "so", "os"]
+DopplerChoice = Literal["auto", "sum", "steer", "fft", "single"]
 PointEncoding = Literal["f4", "f2", "i2"]
 AssociationRule = Literal["optimal", "paper"]
 WINDOWS: tuple[WindowName, ...] = ("rectangular", "hann", "taylor")
 CFAR_KINDS: tuple[CfarKind, ...] = ("ca", "go", "so", "os")
+DOPPLER_CHOICES: tuple[DopplerChoice, ...] = ("auto", "sum", "steer", "fft", "single")
 POINT_ENCODINGS: tuple[PointEncoding, ...] = ("f4", "f2", "i2")
 ASSOCIATION_RULES: tuple[AssociationRule, ...] = ("optimal", "paper")
 
@@ -37,7 +39,12 @@ class HeatmapSettings:
             side, the main lobe included, keep it; the others fall off.
         angle_bins: length of the angle FFT over the filled array (one period of the direction cosine).
         focus: compensate the spherical wavefront at every range bin (needed below 2 D^2 / lambda = 14 m).
-        loops: loops summed coherently; 0 = as many as the ego speed allows, never more than it does.
+        loops: loops used at most; 0 = all.
+        doppler: what becomes of the loops: "sum" adds as many as cannot cancel at the ego speed, "steer" undoes the ego
+            motion towards every direction and adds all, "fft" keeps one map per Doppler bin, "single" uses one loop;
+            "auto" chooses and says why.
+        read_elevation: transform the chirps of the transmitters beside the row too (saturation, elevation check);
+            false spares their time.
         max_saturated_share: share of samples at the ADC's rails above which a frame is refused.
     """
 
@@ -48,6 +55,8 @@ class HeatmapSettings:
     angle_bins: int = 256
     focus: bool = True
     loops: int = 0
+    doppler: DopplerChoice = "auto"
+    read_elevation: bool = True
     max_saturated_share: float = 0.01
 
     def __post_init__(self) -> None:
@@ -63,7 +72,8 @@ class HeatmapSettings:
             self.angle_bins,
             "power of two, 64..4096",
         )
-        require(self.loops >= 0, "heatmap.loops", self.loops, ">= 0 (0 = automatic)")
+        require(self.loops >= 0, "heatmap.loops", self.loops, ">= 0 (0 = all)")
+        require(self.doppler in DOPPLER_CHOICES, "heatmap.doppler", self.doppler, ", ".join(DOPPLER_CHOICES))
         require(0 < self.max_saturated_share <= 1, "heatmap.max_saturated_share", self.max_saturated_share, "0..1")
 
 
@@ -143,6 +153,8 @@ class AssociationSettings:
         range_gate_bins: largest difference of the two corrected ranges of a pair, in range bins.
         level_scale_db: rule "optimal": scale of the logistic distribution of a pair's level difference; 4.34 when both
             boards see a reflector fade independently (Swerling I), less when they partly agree.
+        doppler_sigma_m_s: rule "optimal": standard deviation of a pair's difference of radial speeds, where both radars
+            measured them.
         max_discrepancy_db: rule "paper": unequal counts: pair strongest first and stop beyond this (paper: 3 dB).
         sidelobe_db: detections weaker by more than another one of the radar at the same range are its sidelobes.
         fov_deg: largest angle off boresight along each array (paper: 45).
@@ -153,6 +165,7 @@ class AssociationSettings:
     rule: AssociationRule = "optimal"
     range_gate_bins: float = 0.5
     level_scale_db: float = 3.0
+    doppler_sigma_m_s: float = 0.3
     max_discrepancy_db: float = 3.0
     sidelobe_db: float = 25.0
     fov_deg: float = 45.0
@@ -162,6 +175,7 @@ class AssociationSettings:
     def __post_init__(self) -> None:
         require(self.rule in ASSOCIATION_RULES, "association.rule", self.rule, ", ".join(ASSOCIATION_RULES))
         require(self.level_scale_db > 0, "association.level_scale_db", self.level_scale_db, "> 0")
+        require(self.doppler_sigma_m_s > 0, "association.doppler_sigma_m_s", self.doppler_sigma_m_s, "> 0")
         require(self.sidelobe_db > 0, "association.sidelobe_db", self.sidelobe_db, "> 0")
         require(self.max_discrepancy_db > 0, "association.max_discrepancy_db", self.max_discrepancy_db, "> 0")
         require(self.range_gate_bins > 0, "association.range_gate_bins", self.range_gate_bins, "> 0")

@@ -171,6 +171,27 @@ class PointResponse:
 
 
 @dataclass(frozen=True, slots=True)
+class DopplerMaps:
+    """Range-angle power of every Doppler bin of one burst.
+
+    Args:
+        power: float32 [Doppler, angle, range], as in Heatmap; the imager's buffer.
+        fold: int8 [Doppler, range], multiple of ``interval_m_s`` plus ``most_folds``.
+        speed_m_s: float64 [Doppler], radial speed of each bin without folds, positive away, ascending.
+        interval_m_s: speeds that differ by this look alike from loop to loop.
+        most_folds: largest multiple of the interval.
+        delay_s: middle of the burst after its first chirp.
+    """
+
+    power: Float32
+    fold: NDArray[np.int8]
+    speed_m_s: Float64
+    interval_m_s: float
+    most_folds: int
+    delay_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Heatmap:
     """Range-angle power of one radar.
 
@@ -182,6 +203,9 @@ class Heatmap:
         direction_cosine: float32 [angle], uniform over one period, ascending, -1/(2 pitch) .. +1/(2 pitch).
         range_m: float32 [range], from the phase centre of the array.
         response: how a point target appears; None: unknown, detections are interpolated by plain parabolas.
+        doppler: maps whose largest value ``power`` holds; None: Doppler was not kept.
+        range_drift_m: float32 [angle], what the rig's motion up to the middle of the burst took off a static point's
+            range; None: nothing that counts.
     """
 
     radar: RadarId
@@ -191,6 +215,8 @@ class Heatmap:
     direction_cosine: Float32
     range_m: Float32
     response: PointResponse | None = None
+    doppler: DopplerMaps | None = None
+    range_drift_m: Float32 | None = None
 
 
 @dataclass(frozen=True, slots=True)

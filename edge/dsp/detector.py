@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import CfarSettings, require
+from edge.dsp.doppler import finish
 from edge.dsp.interpolation import PARABOLA
 from edge.dsp.kernels_cfar import (
     mean_decisions,
@@ -83,7 +84,8 @@ class Detector:
         kept = self._keep_reflectors(heatmap, kept)
         self._refine(heatmap, kept)
         columns = self._columns[:, :kept].copy()
-        doppler = np.full(kept, np.nan, dtype=np.float32)
+        cells, ranges = self._cells[self._index[:kept]], heatmap.power.shape[1]
+        doppler = finish(heatmap, cells // ranges, cells % ranges, columns[0])
         return Detections(
             *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, columns[0], columns[1], columns[2]),
             *(doppler, columns[3]),

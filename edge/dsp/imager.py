@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +15,16 @@ from edge.config import AntennaSettings, HeatmapSettings, require
 from edge.dsp import tables, tdm
 from edge.dsp.antenna import along_loss_db
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
+from edge.dsp.doppler import DopplerFft
 from edge.dsp.effective_cells import noise_correlation
+from edge.dsp.elevation import ElevationRows
 from edge.dsp.interpolation import fit_response
 from edge.dsp.kernels_checks import all_zero, dead_channels
+from edge.dsp.kernels_doppler import channel_kernel
 from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
-from edge.errors import CaptureError
+from edge.dsp.row import RowGeometry
+from edge.dsp.steering import Steering
+from edge.errors import CaptureError, PoseError
 from edge.frames import Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
 
 if TYPE_CHECKING:
@@ -27,49 +33,8 @@ if TYPE_CHECKING:
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 SHORTEST_RANGE_M = 0.05
 ANGLE_LANES = 32
-MOST_SECTORS = 9
-LARGEST_MOTION_ERROR_RAD = 0.15
-
-
-@dataclass(frozen=True, slots=True)
-class RowGeometry:
-    """Where every channel stands in the virtual row of one radar.
-
-    Args:
-        element: int64 [slots, receivers], index in the row, ascending along the rig axis; -1: not in the row.
-        count: elements of the row.
-        multiplicity: int64 [count], channels of each element.
-        transmit_m, receive_m: [slots], [receivers] offsets from the phase centre along the rig axis.
-        pitch: element spacing in wavelengths, two-way phase 2 pi pitch u per element.
-    """
-
-    element: NDArray[np.int64]
-    count: int
-    multiplicity: NDArray[np.int64]
-    transmit_m: Float64
-    receive_m: Float64
-    pitch: float
-
-    @classmethod
-    def of(cls, radar: Radar) -> RowGeometry:
-        """Geometry of ``radar``'s row, turned into the rig axis by the mounting's array sign."""
-        position = np.asarray(radar.array.position, dtype=np.int64)
-        inside = position >= 0
-        element = position - position[inside].min()
-        count = int(element[inside].max()) + 1
-        sign = radar.mounting.array_sign
-        element = np.where(inside, element if sign > 0 else count - 1 - element, -1)
-        transmit_m, receive_m = (
-            sign * np.asarray(offset, dtype=np.float64) for offset in radar.array.element_offsets_m()
-        )
-        multiplicity = np.bincount(element[inside], minlength=count)
-        pitch = float(radar.array.pitch_wavelengths(radar.schedule.profile.center_frequency_hz))
-        return cls(element, count, multiplicity, transmit_m, receive_m, pitch)
-
-    def channel_weight(self, taper: Float64) -> Float64:
-        """Weight of every channel [slots, receivers]: the element's taper shared by its channels; 0 outside the row."""
-        per_element = taper / np.maximum(self.multiplicity, 1)
-        return np.where(self.element >= 0, per_element[self.element], 0.0)
+LARGEST_MOTION_ERROR_RAD = 0.03
+"""Motion's phase error over the row, rms at the edge of the field of view, that is left alone."""
 
 
 class Imager:
@@ -77,9 +42,10 @@ class Imager:
 
     Power is LSB^2 per complex sample: a point target of amplitude a LSB in the middle of a cell gives a^2, divided by
     the two-way antenna gain along the array. Elements of the virtual row that are missing are zeros; doubled ones are
-    averaged. The rig's motion turns slot s by 4 pi (v . d) t_s / lambda, which differs from direction d to direction:
-    the field of view is divided into as many sectors as keep the error at a sector's edge below 0.15 rad rms over the
-    row (one up to 0.5 m/s along the array, six at 3 m/s, at most nine), each with its own compensation and angle FFT.
+    averaged. The rig's motion turns the chirp at time t by 4 pi (v . d) t / lambda, which differs from direction d to
+    direction: one compensation serves while its error at the edge of the field of view stays below 0.03 rad rms over
+    the row, beyond that the transmitters' positions are corrected (edge/dsp/steering.py). What becomes of the loops is
+    chosen frame by frame; ``last_report`` says what and why.
 
     Args:
         radar: board, mounting, schedule, calibration.
@@ -106,6 +72,7 @@ class Imager:
         self._wavelength_m = float(self._profile.wavelength_m)
         self._transmit_time_s = np.asarray(radar.schedule.transmit_time_s, dtype=np.float64)
         self._loop_time_s = layout.slots * float(self._profile.chirp_time_s)
+        self._most_loops = min(settings.loops, layout.loops) if settings.loops else layout.loops
         self._make_axes(antenna)
         self._make_blocks()
         self._make_windows()
@@ -119,26 +86,36 @@ class Imager:
         self.range_m = range_m.astype(np.float32)
         self.direction_cosine = cosine.astype(np.float32)
         self._gain = (10.0 ** (0.2 * along_loss_db(antenna, cosine))).astype(np.float32)
-        self._sectors = tuple(tdm.divide(cosine, count) for count in range(1, MOST_SECTORS + 1))
+        (self._sector,) = tdm.divide(cosine, 1)
         self._focus_range_m = np.maximum(range_m, SHORTEST_RANGE_M)
 
     def _make_blocks(self) -> None:
-        """A block is one slot of one device; those without a channel in the row are left out."""
+        """A block is one slot of one device; those of the row come first, then those beside it if they are read."""
         layout, element = self.layout, self.geometry.element
         by_block = element.reshape(layout.slots, layout.devices, layout.rx)
-        pairs = [(s, d) for d in range(layout.devices) for s in range(layout.slots) if (by_block[s, d] >= 0).any()]
+        every = [(s, d) for d in range(layout.devices) for s in range(layout.slots)]
+        pairs = [(s, d) for s, d in every if (by_block[s, d] >= 0).any()]
+        self._row_blocks = len(pairs)
+        if self.settings.read_elevation:
+            pairs += [(s, d) for s, d in every if not (by_block[s, d] >= 0).any()]
         chirp = layout.samples * layout.rx
         self._loop_stride = layout.slots * chirp
         starts = [d * layout.loops * self._loop_stride + s * chirp for s, d in pairs]
         self._block_start = np.array(starts, dtype=np.int64)
-        self._block_slot = np.array([s for s, _ in pairs], dtype=np.int64)
-        self._block_element = np.ascontiguousarray([by_block[s, d] for s, d in pairs], dtype=np.int64)
+        self._block_slot = np.array([s for s, _ in pairs[: self._row_blocks]], dtype=np.int64)
+        self._block_element = np.ascontiguousarray(
+            [by_block[s, d] for s, d in pairs[: self._row_blocks]], dtype=np.int64
+        )
         self._pairs = pairs
         interleaved = layout.kind == "cascade"
         slot, receiver = np.indices((layout.slots, layout.devices * layout.rx))
         device, rx = receiver // layout.rx, receiver % layout.rx
         first = device * layout.loops * self._loop_stride + slot * chirp + rx * (1 if interleaved else layout.samples)
         self._channel_start = np.ascontiguousarray(first, dtype=np.int64)
+        self._channels = self.geometry.channels()
+        index = self._channels.index(layout.slots, layout.devices * layout.rx)
+        by_block = index.reshape(layout.slots, layout.devices, layout.rx)
+        self._block_channel = np.ascontiguousarray([by_block[s, d] for s, d in pairs[: self._row_blocks]])
         self._channel_step = layout.rx if interleaved else 2
         self._channel_word = 1 if interleaved else 2
 
@@ -154,16 +131,23 @@ class Imager:
         angle_taper = tables.taper(self.settings, "angle", geometry.count, (geometry.count - 1) / 2)
         weight = geometry.channel_weight(angle_taper / angle_taper.sum())
         frequency = tables.frequency_of_row(self.points)
+        self._rows = np.argsort(frequency).astype(np.int64) * rx
         phase = np.zeros((*weight.shape, self.points))
         if self.settings.focus:
             a, b = geometry.transmit_m[:, None, None], geometry.receive_m[None, :, None]
             baked = tables.curvature_m(calibration.reference_range_m, a, b)
             phase = -2.0 * np.pi / self._wavelength_m * (tables.curvature_m(self._focus_range_m, a, b) - baked)
-        focus = weight[..., None] * np.exp(1j * phase[..., frequency])
+        phasor = np.exp(1j * phase[..., frequency])
         self._window = np.zeros((len(self._pairs), 2, self.points * rx), dtype=np.float32)
-        self._focus = np.zeros_like(self._window)
+        self._focus = np.zeros((self._row_blocks, 2, self.points * rx), dtype=np.float32)
+        self._phasors = np.zeros_like(self._focus)
+        self._elevation = ElevationRows(
+            *(self.radar, self._pairs, phasor, self._rows, geometry.transmit_m[:, None] + geometry.receive_m),
+            *(self._transmit_time_s, self._wavelength_m),
+        )
+        sources = ((self._window, channel), (self._focus, weight[..., None] * phasor), (self._phasors, phasor))
         for block, (s, d) in enumerate(self._pairs):
-            for table, source in ((self._window, channel), (self._focus, focus)):
+            for table, source in sources[: 3 if block < self._row_blocks else 1]:
                 values = source[s, d * rx : (d + 1) * rx].T.reshape(-1)
                 table[block, 0, : len(values)] = values.real
                 table[block, 1, : len(values)] = values.imag
@@ -209,12 +193,11 @@ class Imager:
     def _make_buffers(self) -> None:
         layout, bins, plane = self.layout, self.settings.angle_bins, self.points * self.layout.rx
         self._range_kernel = range_kernel(layout.kind == "cascade", layout.iq_order == "QI", self.points, layout.rx)
+        self._channel_kernel = channel_kernel(self.points, layout.rx)
         self._row_kernel = row_kernel(self.points, layout.rx)
         self._angle_kernel = angle_kernel(bins, self.points, ANGLE_LANES)
         self._range_twiddle = tables.twiddles(self.points, -1, layout.rx)
         self._angle_twiddle = tables.twiddles(bins, +1, 0)
-        frequency = tables.frequency_of_row(self.points)
-        self._rows = np.argsort(frequency).astype(np.int64) * layout.rx
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
         self._phasor = np.ones(layout.slots, dtype=np.complex64)
         self._spectra = np.zeros((len(self._pairs), 2 * plane), dtype=np.float32)
@@ -225,12 +208,43 @@ class Imager:
         self._power = np.zeros((bins, self.points), dtype=np.float32)
         self._aligned = np.zeros(layout.int16_count // 2, dtype=np.int32)
         self._dead = np.zeros((layout.slots, layout.devices * layout.rx), dtype=np.uint8)
+        loops = tables.next_power_of_two(self._most_loops)
+        self._cube = np.zeros((len(self._channels.slot), loops, 2, self.points), dtype=np.float32)
+        time_s = self._transmit_time_s + self._loop_time_s * np.arange(self._most_loops)[:, None]
+        self._steering = Steering(
+            *(self.geometry, self._channels, self.settings, time_s, self._wavelength_m, self.points, self._gain),
+            self.direction_cosine.astype(np.float64),
+        )
 
-    def loops_for(self, velocity_rig_m_s: Float64 | None) -> int:
-        """Loops summed coherently at this velocity; none given counts as standing still."""
-        most = min(self.settings.loops, self.layout.loops) if self.settings.loops else self.layout.loops
-        speed_m_s = 0.0 if velocity_rig_m_s is None else tdm.radial_speed_in_fov_m_s(velocity_rig_m_s)
-        return tdm.coherent_loops(speed_m_s, self._wavelength_m, self._loop_time_s, most)
+    def choice(self, velocity_rig_m_s: Float64 | None) -> tdm.Choice:
+        """What becomes of a burst's loops at this velocity; none given counts as standing still."""
+        most = self._most_loops
+        forward_m_s, along_m_s = self._motion(velocity_rig_m_s)
+        known = velocity_rig_m_s is not None
+        speed_m_s = tdm.radial_speed_in_fov_m_s(velocity_rig_m_s) if velocity_rig_m_s is not None else 0.0
+        coherent = tdm.coherent_loops(speed_m_s, self._wavelength_m, self._loop_time_s, most)
+        steerable = most
+        if speed_m_s > 0.0 and coherent < most:
+            bin_m = float(self.range_m[1] - self.range_m[0]) * self.points / self.layout.samples
+            in_bin = int(bin_m / (speed_m_s * self._loop_time_s))
+            steerable = min(most, max(1, in_bin), self._steering.loops_that_fit(forward_m_s, along_m_s, most))
+        return tdm.choose(self.settings.doppler, most, coherent, steerable, speed_m_s if known else None)
+
+    def _motion(self, velocity: Float64 | None) -> tuple[float, float]:
+        """Speeds along boresight and along the array."""
+        if velocity is None:
+            return 0.0, 0.0
+        forward_m_s, along_m_s = float(velocity[0]), float(velocity[tdm.array_axis(self.radar.radar)])
+        if not math.isfinite(forward_m_s + along_m_s):
+            raise PoseError("velocity of the rig is no number", value=velocity.tolist(), allowed="finite m/s")
+        return forward_m_s, along_m_s
+
+    @cached_property
+    def _doppler(self) -> DopplerFft:
+        return DopplerFft(
+            *(self.geometry, self._channels, self.settings, self._most_loops, self.layout.slots, self._loop_time_s),
+            *(self._wavelength_m, self.points, self._gain),
+        )
 
     def process(
         self,
@@ -248,6 +262,7 @@ class Imager:
         Raises:
             CaptureError: another radar's frame, or another layout than the schedule's.
             FrameRejected: all samples zero, or too many at the rails.
+            PoseError: the velocity is no number.
         """
         if frame.radar != self.radar.radar or frame.layout != self.layout:
             raise CaptureError(
@@ -259,40 +274,63 @@ class Imager:
         adc = self._packed(frame)
         if all_zero(adc):
             raise reject_all_zero(frame)
-        loops = self.loops_for(velocity_rig_m_s)
-        self._report(adc, loops, self._run_range(adc, loops))
+        choice = self.choice(velocity_rig_m_s)
+        by_loop = choice.name in ("steer", "fft")
+        rails = self._run_loops(adc, choice) if by_loop else self._run_range(adc, choice.loops)
+        self._report(adc, choice, rails)
         if self.last_report.saturated_share > self.settings.max_saturated_share:
             raise reject_saturated(frame, self.last_report.saturated_share, self.settings.max_saturated_share)
-        if slot_phasors is not None:
-            np.divide(slot_phasors, loops, out=self._phasor, casting="same_kind")
-            self._run_angle(self._sectors[0][0])
-        else:
-            self._run_sectors(velocity_rig_m_s, loops)
-        return Heatmap(
+        heatmap = Heatmap(
             *(frame.radar, frame.number, frame.t_first_chirp_ns, self._power, self.direction_cosine, self.range_m),
             response=self._response,
         )
+        if choice.name == "fft":
+            self._doppler.run(self._cube, self._power)
+            return replace(heatmap, doppler=self._doppler.maps)
+        if slot_phasors is not None:
+            np.divide(slot_phasors, choice.loops, out=self._phasor, casting="same_kind")
+            self._run_angle(self._sector)
+            return heatmap
+        return self._undo_motion(heatmap, choice, *self._motion(velocity_rig_m_s))
 
-    def _run_range(self, adc: NDArray[np.int32], loops: int) -> int:
-        """Fill ``_spectra`` from the raw words; returns the codes at the rails."""
+    def _run_range(self, adc: NDArray[np.int32], loops: int, blocks: int | None = None) -> int:
+        """Fill ``_spectra`` from the raw words, summed over loops; returns the codes at the rails."""
         rails = self._range_kernel(
-            *(adc, loops, self._loop_stride, self._block_start, self.layout.samples, self._window),
+            *(adc, loops, self._loop_stride, self._block_start[:blocks], self.layout.samples, self._window),
             *(self._range_twiddle, self._sums, self._spectra),
         )
         return int(rails)
 
-    def _run_sectors(self, velocity: Float64 | None, loops: int) -> None:
-        """Undo the motion and fill ``_power``, sector by sector."""
-        forward_m_s = 0.0 if velocity is None else float(velocity[0])
-        along_m_s = 0.0 if velocity is None else float(velocity[tdm.array_axis(self.radar.radar)])
-        for sector in self._sectors[self._sector_count(along_m_s) - 1]:
-            closing_m_s = forward_m_s * math.sqrt(1.0 - sector.centre**2) + along_m_s * sector.centre
-            set_phasors(self._phasor, -closing_m_s, self._transmit_time_s, self._wavelength_m, float(loops))
-            self._run_angle(sector)
+    def _run_loops(self, adc: NDArray[np.int32], choice: tdm.Choice) -> int:
+        """Fill ``_cube`` loop by loop, transmitters beside the row in the last loop; returns the codes at the rails."""
+        focus, rails = self._focus if choice.name == "fft" else self._phasors, 0
+        for loop in range(choice.loops):
+            blocks = self._row_blocks if loop + 1 < choice.loops else len(self._pairs)
+            rails += self._run_range(adc[loop * self._loop_stride :], 1, blocks)
+            self._order_channels(focus, loop)
+        return rails
 
-    def _sector_count(self, along_m_s: float) -> int:
-        error_rad = self._motion_rad_s_m * abs(along_m_s) * tdm.FOV_COSINE
-        return min(max(1, math.ceil(error_rad / LARGEST_MOTION_ERROR_RAD)), MOST_SECTORS)
+    def _order_channels(self, focus: Float32, loop: int) -> None:
+        """Focus ``_spectra`` into one loop of ``_cube``."""
+        self._channel_kernel(
+            *(self._spectra, focus, self._rows, self._block_channel, self._row_work, loop, self._cube),
+        )
+
+    def _undo_motion(self, heatmap: Heatmap, choice: tdm.Choice, forward_m_s: float, along_m_s: float) -> Heatmap:
+        """Fill ``_power`` with the motion undone: by one phase per slot while that is enough, else by steering."""
+        slowest_m_s, fastest_m_s = tdm.closing_range_m_s(forward_m_s, along_m_s)
+        summed = choice.name != "steer"
+        if summed and self._motion_rad_s_m * 0.5 * (fastest_m_s - slowest_m_s) <= LARGEST_MOTION_ERROR_RAD:
+            closing_m_s = 0.5 * (slowest_m_s + fastest_m_s)
+            set_phasors(self._phasor, -closing_m_s, self._transmit_time_s, self._wavelength_m, float(choice.loops))
+            self._run_angle(self._sector)
+            return heatmap
+        if summed:
+            self._order_channels(self._phasors, 0)
+        self._steering.run(self._cube, forward_m_s, along_m_s, 1 if summed else choice.loops, self._power)
+        if summed and choice.loops > 1:
+            self._power *= np.float32(1.0 / choice.loops**2)
+        return replace(heatmap, range_drift_m=self._steering.range_drift_m)
 
     def _run_angle(self, sector: tdm.Sector) -> None:
         """Fill the sector's rows of ``_power`` from ``_spectra`` and ``_phasor``."""
@@ -313,14 +351,34 @@ class Imager:
         np.copyto(self._aligned, words)
         return self._aligned
 
-    def _report(self, adc: NDArray[np.int32], loops: int, rails: int) -> None:
+    def _report(self, adc: NDArray[np.int32], choice: tdm.Choice, rails: int) -> None:
         layout = self.layout
-        share = rails / (2 * loops * len(self._pairs) * layout.samples * layout.rx)
+        beside = len(self._pairs) - self._row_blocks
+        blocks = choice.loops * self._row_blocks + beside * (1 if choice.name in ("steer", "fft") else choice.loops)
+        share = rails / (2 * blocks * layout.samples * layout.rx)
         dead = dead_channels(
             adc, self._channel_start, layout.samples, self._channel_step, self._channel_word, self._dead
         )
         names = dead_names(self._dead, self.radar.schedule.transmitters) if dead else ()
-        self.last_report = FrameReport(loops, share, names)
+        self.last_report = FrameReport(choice.loops, share, names, choice.name, choice.reason)
+
+    def elevation_beams(
+        self, range_bin: int, direction_cosine: float, closing_m_s: float = 0.0
+    ) -> tuple[Float64, Complex64]:
+        """Beams of all rows of the board towards one cell of the last frame (its last loop, or the loops' sum).
+
+        Args:
+            range_bin, direction_cosine: of the cell.
+            closing_m_s: speed at which a static point there comes nearer.
+        Returns:
+            float64 [rows], phase of each row in turns per direction cosine across the array (rig axis z for the
+            horizontal radar, y for the vertical one), and complex64 [rows], the beams.
+        Raises:
+            ConfigError: ``heatmap.read_elevation`` is off.
+        """
+        require(self.settings.read_elevation, "heatmap.read_elevation", False, "true for beams of the elevation rows")
+        beams = self._elevation.beams(self._spectra, range_bin, direction_cosine, closing_m_s)
+        return self._elevation.turns_per_cosine, beams
 
     @property
     def row(self) -> Float32:
