@@ -20,7 +20,9 @@ would pair. What is weaker by more than ``sidelobe_db`` than a detection of the 
 ``SIDELOBE_BINS``) is left out.
 
 Rule "optimal". What a pair is worth is its log-likelihood over that of a pair at the gate's edge with equal levels:
-(g^2 - dr^2) / 2 sigma^2 - 2 ln cosh(dL / 2 s). Range differences dr are Gaussian, the gate g is 3 sigma. Powers of a
+(g^2 - dr^2) / 2 sigma^2 - 2 ln cosh(dL / 2 s) - dv^2 / 2 sigma_v^2. Range differences dr are Gaussian, the gate g is
+3 sigma; so are differences dv of radial speed, where both radars measured it: beside a moving rig every lateral
+direction has its own, which tells the vertical radar's detections apart. Powers of a
 reflector that fades independently for both boards (Swerling I) are exponential, so the difference dL of its levels is
 logistic, of scale s = 10 / ln 10 dB; partly common fading makes s less. Pairs that cannot be a point of the kept region
 (u^2 + w^2 > 1, below ground, too high) are worth nothing. Of all one-to-one assignments the worthiest is taken
@@ -141,7 +143,8 @@ class Associator:
         self._pattern = np.array(pattern, dtype=np.float64)
         self._up = np.append(up_in_rig(rig.geometry), rig.geometry.height_m)
         self._limits = np.array([self.settings.ground_margin_m, self.settings.max_height_m], dtype=np.float64)
-        self._scales = np.array([self._gate_m / RANGE_SIGMAS, self.settings.level_scale_db, 0.5 * RANGE_SIGMAS**2])
+        spreads = (self._gate_m / RANGE_SIGMAS, self.settings.level_scale_db, self.settings.doppler_sigma_m_s)
+        self._scales = np.array([*spreads, 0.5 * RANGE_SIGMAS**2])
         self._weight = np.zeros(CANDIDATES)
         self._counts = np.zeros(11, dtype=np.int64)
         self._board_m = np.zeros((2, 3))
@@ -207,7 +210,17 @@ class Associator:
             self._weight = np.zeros(2 * candidates)
         assignment.weigh(
             *(self._order, split, self._common, self._level, self._source, _columns(horizontal), _columns(vertical)),
-            *(self._board_m, self._up, self._limits, self._scales, self._first, self._start, self._weight),
+            *(
+                horizontal.doppler_m_s,
+                vertical.doppler_m_s,
+                self._board_m,
+                self._up,
+                self._limits,
+                self._scales,
+                self._first,
+                self._start,
+                self._weight,
+            ),
         )
         found = assignment.assign(
             *(self._order, split, total, self._first, self._start, self._weight, self._price, self._assignment),

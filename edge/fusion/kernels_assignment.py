@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float32, float64, int64, njit, types
 
 from edge.fusion.kernels_association import BINS, COLUMNS, POWER, REAL, UNMATCHED, WHOLE, judge
 
@@ -49,22 +49,38 @@ def windows(order, split, total, common, gate_m, first, start):  # type: ignore[
 
 @njit(
     types.void(
-        *(WHOLE, int64, REAL, REAL, WHOLE, COLUMNS, COLUMNS),
+        *(WHOLE, int64, REAL, REAL, WHOLE, COLUMNS, COLUMNS, float32[::1], float32[::1]),
         *(float64[:, ::1], REAL, REAL, REAL, WHOLE, WHOLE, REAL),
     ),
     **OPTIONS,
 )
 def weigh(  # type: ignore[no-untyped-def]
-    order, split, common, level, source, horizontal, vertical, board, up, limits, scales, first, start, weight
+    order,
+    split,
+    common,
+    level,
+    source,
+    horizontal,
+    vertical,
+    speed_h,
+    speed_v,
+    board,
+    up,
+    limits,
+    scales,
+    first,
+    start,
+    weight,
 ):
-    """Weight of every candidate: dr^2 / 2 sigma^2 + 2 ln cosh(dL / 2 s) - most, but never above 0.
+    """Weight of every candidate: dr^2 / 2 sigma^2 + 2 ln cosh(dL / 2 s) + dv^2 / 2 sigma_v^2 - most, but never above 0.
 
     Args:
         order, split, common, first, start: as ``windows`` has them.
         level, source: by detection; what can be compared, and the index in the radar's columns.
         horizontal, vertical: columns of the radars.
+        speed_h, speed_v: [n], radial speeds, NaN where none was measured: such a pair has no term in dv.
         board, up, limits: as ``judge`` has them; what it refuses weighs 0.
-        scales: [3], sigma of dr in m, s in dB, most.
+        scales: [4], sigma in m, s in dB, sigma_v in m/s, most.
         weight: [candidates or more], receives the weights.
     """
     for i in range(split):
@@ -74,7 +90,10 @@ def weigh(  # type: ignore[no-untyped-def]
         for e in range(start[i], start[i + 1]):
             v = order[split + first[i] + e - start[i]]
             apart, louder = (common[h] - common[v]) / scales[0], abs(level[h] - level[v]) / scales[1]
-            worth = 0.5 * apart * apart + louder + 2.0 * np.log(0.5 + 0.5 * np.exp(-louder)) - scales[2]
+            worth = 0.5 * apart * apart + louder + 2.0 * np.log(0.5 + 0.5 * np.exp(-louder)) - scales[3]
+            faster = (float64(speed_h[n]) - float64(speed_v[source[v]])) / scales[2]
+            if faster == faster:
+                worth += 0.5 * faster * faster
             weight[e] = 0.0
             if worth < 0.0:
                 m = source[v]

@@ -24,6 +24,7 @@ class Seen:
         range_m, cosine, power_db: as detected, power with the mounting's offset.
         common_m: range from the common origin.
         level_db: power less the other radar's two-way loss at this cosine.
+        speed_m_s: radial speed, NaN: not measured.
     """
 
     horizontal: bool
@@ -33,6 +34,7 @@ class Seen:
     power_db: float
     common_m: float
     level_db: float
+    speed_m_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +87,9 @@ def described(
         direction = np.array([math.sqrt(1 - c * c), c, 0.0] if horizontal else [math.sqrt(1 - c * c), 0.0, c])
         off = board_m - origin_m
         off[2 if horizontal else 1] = 0.0
-        common = float(np.linalg.norm(off + r * direction))
-        seen.append(Seen(horizontal, index, r, c, p + offset_db, common, p + offset_db - 2.0 * loss_db(c, antenna)))
+        common, speed = float(np.linalg.norm(off + r * direction)), float(detections.doppler_m_s[index])
+        level = p + offset_db - 2.0 * loss_db(c, antenna)
+        seen.append(Seen(horizontal, index, r, c, p + offset_db, common, level, speed))
     return seen
 
 
@@ -119,11 +122,12 @@ def paired(members: list[Seen], max_discrepancy_db: float) -> list[tuple[Seen, S
     return pairs
 
 
-def worth(h: Seen, v: Seen, sigma_m: float, scale_db: float) -> float:
-    """Log-likelihood of a pair over that of one at 3 sigma with equal levels: Gaussian ranges, logistic levels."""
+def worth(h: Seen, v: Seen, sigma_m: float, scale_db: float, sigma_m_s: float) -> float:
+    """Log-likelihood of a pair over that of one at 3 sigma in range: Gaussian ranges and speeds, logistic levels."""
     apart, louder = (h.common_m - v.common_m) / sigma_m, abs(h.level_db - v.level_db) / (2.0 * scale_db)
     log_cosh = louder + math.log1p(math.exp(-2.0 * louder)) - math.log(2.0)
-    return 0.5 * (3.0**2 - apart**2) - 2.0 * log_cosh
+    faster = (h.speed_m_s - v.speed_m_s) / sigma_m_s
+    return 0.5 * (3.0**2 - apart**2) - 2.0 * log_cosh - (0.0 if math.isnan(faster) else 0.5 * faster**2)
 
 
 def worthiest(value: Float64) -> list[tuple[int, int]]:
@@ -196,7 +200,7 @@ def values(
     for i, h in enumerate(horizontal):
         for j, v in enumerate(vertical):
             if abs(h.common_m - v.common_m) <= gate_m and region.holds(located(h, v, a, b)):
-                value[i, j] = worth(h, v, gate_m / 3.0, settings.level_scale_db)
+                value[i, j] = worth(h, v, gate_m / 3.0, settings.level_scale_db, settings.doppler_sigma_m_s)
     return horizontal, vertical, value
 
 

@@ -58,11 +58,11 @@ def rig(
 
 
 def detections(radar: str, rows: Any, t_ns: int = 0, number: int = 7) -> Detections:
-    """Rows of range, cosine, power."""
-    table = np.array(rows, dtype=np.float32).reshape(-1, 3)
+    """Rows of range, cosine, power and, where it was measured, radial speed."""
+    table = np.array(rows, dtype=np.float32).reshape(len(rows), np.shape(rows)[1] if len(rows) else 3)
     nothing = np.full(len(table), np.nan, dtype=np.float32)
     columns = [np.ascontiguousarray(column) for column in table.T]
-    return Detections(radar, number, t_ns, *columns, nothing, nothing)  # type: ignore[arg-type]
+    return Detections(radar, number, t_ns, *columns[:3], *(columns[3:] or [nothing]), nothing)  # type: ignore[arg-type]
 
 
 def both(horizontal: Any, vertical: Any, vertical_t_ns: int = 0) -> tuple[Detections, Detections]:
@@ -338,7 +338,8 @@ def random_rows(rng: np.random.Generator, count: int, clustered: bool) -> Any:
         range_m, power_db = 5.0 + BIN_M * rng.uniform(0, 0.12 * count + 0.1, count), rng.integers(0, 6, count)
     else:
         range_m, power_db = rng.uniform(0.5, 14.0, count), rng.uniform(-5, 25, count)
-    return np.stack([range_m, rng.uniform(-0.9, 0.9, count), power_db], axis=1)
+    speed_m_s = np.where(rng.random(count) < 0.7, rng.normal(0.0, 0.5, count), np.nan)
+    return np.stack([range_m, rng.uniform(-0.9, 0.9, count), power_db, speed_m_s], axis=1)
 
 
 @settings(max_examples=60, deadline=None)

@@ -105,6 +105,25 @@ def test_the_level_difference_of_a_lone_pair_has_a_closed_form() -> None:
         assert len(Associator(rig()).process(*both([[5, 0, 0]], [[5, 0, share * widest_db]]))) == points
 
 
+def test_radial_speeds_tell_apart_what_ranges_and_levels_do_not() -> None:
+    """Beside a rig at 5 m/s the vertical radar's detections have the speeds of their lateral directions."""
+    horizontal = [[5.0, 0.3, 10.0, -1.5], [5.001, -0.2, 10.0, 1.0]]
+    vertical = [[5.0, 0.1, 10.0, 1.1], [5.001, -0.1, 10.0, -1.6]]
+    xyz = Associator(rig()).process(*both(horizontal, vertical)).xyz_m
+    np.testing.assert_allclose(xyz[:, 1:], [[1.5, -0.5001], [-1.0002, 0.5]], atol=1e-4)
+    for row in horizontal + vertical:
+        row[3] = math.nan
+    xyz = Associator(rig()).process(*both(horizontal, vertical)).xyz_m
+    np.testing.assert_allclose(xyz[:, 1:], [[1.5, 0.5], [-1.0002, -0.5001]], atol=1e-4)
+
+
+def test_three_sigma_of_radial_speed_are_worth_nothing() -> None:
+    sigma_m_s = AssociationSettings().doppler_sigma_m_s
+    for share, points in ((2.99, 1), (3.01, 0)):
+        frames = both([[5.0, 0.0, 1.0, 0.0]], [[5.0, 0.0, 1.0, share * sigma_m_s]])
+        assert len(Associator(rig()).process(*frames)) == points
+
+
 @pytest.mark.parametrize(("w", "cause"), [(-0.25, "below ground"), (0.6, "too high"), (0.69, "no vector")])
 def test_what_can_be_no_point_takes_no_partner_away(w: float, cause: str) -> None:
     """A ghost with exactly the level of the target: the paper's rule gives it the target's partner."""
@@ -160,7 +179,7 @@ def test_kernels_allocate_nothing() -> None:
     assert rtsys.get_allocation_stats().alloc - before.alloc <= handed
 
 
-@pytest.mark.parametrize("key", ["level_scale_db", "sidelobe_db", "range_gate_bins"])
+@pytest.mark.parametrize("key", ["level_scale_db", "doppler_sigma_m_s", "sidelobe_db", "range_gate_bins"])
 def test_settings_that_cannot_work_are_refused(key: str) -> None:
     with pytest.raises(ConfigError, match=f"association.{key}"):
         AssociationSettings(**{key: 0.0})

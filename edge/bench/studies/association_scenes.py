@@ -26,6 +26,8 @@ from edge.reference.point_targets import make_frame
 from edge.rig import Rig
 
 MIDDLE_M, NEAREST_M, REFERENCE_M = 6.0, 2.0, 5.0
+DOPPLER_M_S = 0.1
+"""Standard deviation of a radial speed."""
 STRENGTH_DB, SPREAD_DB = 30.0, 6.0
 """SNR of a mean reflector on boresight at the reference range; standard deviation of reflectors."""
 RESOLUTION = (1.5, 0.03)
@@ -45,6 +47,7 @@ class Level:
         ghosts: detections without counterpart and multipath copies per reflector and radar.
         jitter_bins: standard deviation of a detection's range, in range bins.
         pattern: true loss across the arrays over the modelled one.
+        speed_m_s: the rig drives sideways; its radars measure radial speeds; 0: they do not.
     """
 
     name: str
@@ -55,6 +58,7 @@ class Level:
     ghosts: float = 0.3
     jitter_bins: float = 0.05
     pattern: float = 1.0
+    speed_m_s: float = 0.0
 
 
 LEVELS = (
@@ -70,6 +74,8 @@ LEVELS = (
     Level("boards 6 dB apart", offset_db=6.0),
     Level("range jitter 0.15 bin", jitter_bins=0.15),
     Level("half the modelled pattern", pattern=0.5),
+    Level("60 within 4 m, Doppler at 1 m/s", targets=60, depth_m=4.0, ghosts=0.6, speed_m_s=1.0),
+    Level("60 within 4 m, Doppler at 5 m/s", targets=60, depth_m=4.0, ghosts=0.6, speed_m_s=5.0),
 )
 
 
@@ -102,12 +108,12 @@ def _reflectors(rng: np.random.Generator, targets: int, depth_m: float, height_m
 def _measured(
     points_m: Float64, strength_db: Float64, board_m: Float64, axis: int, antenna: AntennaSettings
 ) -> Float64:
-    """Range, direction cosine and SNR [n, 3] of points for a board whose array lies along ``axis``."""
+    """Range, direction cosine, SNR and lateral cosine [n, 4] of points for a board whose array lies along ``axis``."""
     away = points_m - board_m
     range_m = np.linalg.norm(away, axis=1)
     cosine, across = away[:, axis] / range_m, away[:, 3 - axis] / range_m
     loss_db = 2.0 * across_loss_db(antenna, across) + 40.0 * np.log10(range_m / REFERENCE_M)
-    return np.stack([range_m, cosine, strength_db - loss_db], axis=1)
+    return np.stack([range_m, cosine, strength_db - loss_db, away[:, 1] / range_m], axis=1)
 
 
 def _resolved(rows: Float64, bin_m: float) -> NDArray[np.int64]:
@@ -121,11 +127,12 @@ def _resolved(rows: Float64, bin_m: float) -> NDArray[np.int64]:
     return np.array(kept, dtype=np.int64)
 
 
-def detections(radar: RadarId, rows: Float64, number: int = 0) -> Detections:
-    """Columns from rows of range, direction cosine and power."""
+def detections(radar: RadarId, rows: Float64, speed_m_s: Float64 | None = None) -> Detections:
+    """Columns from rows of range, direction cosine and power; radial speeds when they were measured."""
     columns = [np.ascontiguousarray(column) for column in rows.astype(np.float32).T]
     nothing = np.full(len(rows), np.nan, dtype=np.float32)
-    return Detections(radar, number, 0, columns[0], columns[1], columns[2], nothing, columns[2])
+    speed = nothing if speed_m_s is None else speed_m_s.astype(np.float32)
+    return Detections(radar, 0, 0, columns[0], columns[1], columns[2], speed, columns[2])
 
 
 def detection_scene(rng: np.random.Generator, level: Level, rig: Rig) -> Scene:
@@ -147,19 +154,20 @@ def detection_scene(rng: np.random.Generator, level: Level, rig: Rig) -> Scene:
             below_m, mirrored_db + rng.normal(0.0, level.fading_db, len(below_m)), board_m, axis, antenna
         )
         late = direct[rng.random(count) < 0.25 * level.ghosts]
-        late = late + np.stack(
-            [rng.uniform(0.15, 1.0, len(late)), np.zeros(len(late)), -rng.uniform(4, 15, len(late))], 1
-        )
+        late[:, 0] += rng.uniform(0.15, 1.0, len(late))
+        late[:, 2] -= rng.uniform(4.0, 15.0, len(late))
         alone = rng.poisson(0.5 * level.ghosts * count)
         span = (direct[:, 0].min(), direct[:, 0].max())
-        noise = np.stack([rng.uniform(*span, alone), rng.uniform(-0.7, 0.7, alone), rng.exponential(6.0, alone)], 1)
+        noise = np.stack([rng.uniform(*span, alone), *rng.uniform(-0.7, 0.7, (3, alone))], axis=1)
+        noise[:, 2] = rng.exponential(6.0, alone)
         rows = np.concatenate([direct, mirror, late, noise])
         rows[:, 0] += rng.normal(0.0, level.jitter_bins * bin_m, len(rows))
         rows[:, 1] += rng.normal(0.0, 0.002, len(rows))
         rows[:, 2] += level.offset_db * (radar == "vertical")
         kept = _resolved(rows, bin_m)
         seen &= np.isin(np.arange(count), kept)
-        found.append(detections(radar, rows[kept]))
+        speed = rng.normal(-level.speed_m_s * rows[kept, 3], DOPPLER_M_S) if level.speed_m_s else None
+        found.append(detections(radar, rows[kept, :3], speed))
     return Scene(found[0], found[1], np.zeros(3), truth_m, seen)
 
 
