@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rfconstruct import``: captures of the boards' own tools to a recording; TI's calibration file to ours."""
+"""``rfconstruct import``: captures of the boards' own tools to a recording; TI's calibration file to ours.
+
+Poses must be on the clock of the frames. That clock starts where ``--start-ns`` says; without it one radar's TI capture
+keeps its board's clock, and every other capture starts at 0.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,9 +18,12 @@ from typing import Any
 from edge.calibration import save_calibration
 from edge.commands.open_source import add_rig_arguments, named_path, rig_of
 from edge.errors import ConfigError, ExitCode
-from edge.frames import RadarId
+from edge.frames import Pose, RadarId
+from edge.odometry.vehicle import rig_poses
 from edge.recording.importing import ImportReport, import_capture, import_poses
 from edge.rig import Rig
+
+LATEST_START_NS = 2**62
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,11 +32,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "capture",
         nargs="+",
         metavar="[RADAR=]PATH",
-        help="TI capture folder, adc_data.bin or TI calibration (.mat); for a rig of two radars one of each",
+        help="TI capture folder, adc_data.bin, TI calibration (.mat); one a radar",
     )
     add_rig_arguments(parser)
-    parser.add_argument("--poses", type=Path, help="poses on the frames' clock: CSV, JSON lines, or TUM (.tum, .txt)")
-    parser.add_argument("--out", type=Path, required=True, help="file to make; must not exist")
+    parser.add_argument(
+        "--poses", type=Path, metavar="FILE", help="on the frames' clock: CSV, JSON lines, TUM (.tum, .txt)"
+    )
+    parser.add_argument(
+        "--poses-of",
+        choices=("rig", "vehicle"),
+        default="rig",
+        metavar="WHOSE",
+        help="rig, or vehicle (base_link): apply the rig's geometry (default: rig)",
+    )
+    parser.add_argument(
+        "--start-ns",
+        type=start_ns,
+        metavar="NS",
+        help="first chirp on poses' clock; default: one radar's TI capture has the board's clock, others begin at 0",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to make; must not exist")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,11 +64,22 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.out} exists", action="choose another name: nothing is overwritten")
     if any(path.suffix == ".mat" for path in inputs.values()):
         return _import_calibration(args, rig, inputs)
-    poses = import_poses(args.poses) if args.poses is not None else []
+    poses: Iterable[Pose] = import_poses(args.poses) if args.poses is not None else []
+    if args.poses_of == "vehicle":
+        poses = rig_poses(poses, rig.geometry)
     with _bar(args.json) as bar:
-        report = import_capture(inputs, rig, args.out, poses, progress=lambda done, total: _advance(bar, done, total))
+        report = import_capture(
+            *(inputs, rig, args.out, poses), lambda done, total: _advance(bar, done, total), args.start_ns
+        )
     print(json.dumps(_as_dict(report, args.out), indent=2) if args.json else "\n".join(_lines(report, args.out)))
     return ExitCode.DEGRADED if any(report.lost[radar] for radar in report.lost) else ExitCode.OK
+
+
+def start_ns(text: str) -> int:
+    """Nanoseconds; argparse.ArgumentTypeError when they are not whole or cannot be recorded."""
+    if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) <= LATEST_START_NS):
+        raise argparse.ArgumentTypeError(f"got {text!r}; allowed: 0..{LATEST_START_NS} ns")
+    return int(text)
 
 
 def _import_calibration(args: argparse.Namespace, rig: Rig, inputs: dict[RadarId, Path]) -> int:

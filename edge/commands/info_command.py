@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rfconstruct info``: describes a recording, a rig (with every hardware rule) or a model folder."""
+"""``rfconstruct info``: describes a recording, a capture folder, a rig (with every hardware rule) or a model folder."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from typing import Any
 from edge.completion.manifest import find_model, read_files, read_manifest
 from edge.constraints import format_table
 from edge.errors import ConfigError, ExitCode, ModelError
+from edge.frames import RADARS
 from edge.recording.reader import RecordingReader
 from edge.rig import Rig, known_rigs, load_rig
+from edge.sources.ti_capture import describe_capture
+from edge.sources.ti_index import Gap, gap_notes
 from edge.waveform import Schedule
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("target", help="recording (.mcap), rig name or folder, model name or folder")
+    parser.add_argument("target", help="recording (.mcap), TI capture folder, rig name or folder, model name or folder")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,6 +35,10 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(content, indent=2, default=str) if args.json else "\n".join(pairs(content)))
         return ExitCode.OK
     if args.target not in known_rigs() and not (path / "rig.toml").is_file():
+        content = describe_folder(path)
+        if content:
+            print(json.dumps(content, indent=2) if args.json else "\n".join(pairs(_with_gaps_in_words(content))))
+            return ExitCode.OK
         content = describe_model(_find_model(args.target))
         print(json.dumps(content, indent=2) if args.json else "\n".join(pairs(content)))
         return ExitCode.OK
@@ -40,12 +47,34 @@ def run(args: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
+def describe_folder(folder: Path) -> dict[str, Any]:
+    """What the capture in a folder is, or those in its folders ``horizontal`` and ``vertical``; empty: none is there.
+
+    Raises:
+        CaptureError: an index file that cannot be read.
+    """
+    found: dict[str, Any] = describe_capture(folder)
+    both = {radar: describe_capture(folder / radar) for radar in RADARS}
+    return found or {radar: content for radar, content in both.items() if content}
+
+
+def _with_gaps_in_words(content: dict[str, Any]) -> dict[str, Any]:
+    words = dict(content)
+    for radar in words.keys() & set(RADARS):
+        words[radar] = _with_gaps_in_words(words[radar])
+    if "gaps" in words:
+        gaps = [Gap(gap["after_frame"], gap["duration_s"], gap["frames_missing"]) for gap in words["gaps"]]
+        told = zip(gap_notes(gaps), gaps, strict=True)
+        words["gaps"] = [f"{note} ({gap.missing} missing)" for note, gap in told] or "none"
+    return words
+
+
 def _find_model(name: str) -> Path:
     """Folder of the model; ConfigError when nothing at all has this name."""
     try:
         return find_model(name)
     except ModelError as error:
-        allowed = f"a recording, a rig ({', '.join(known_rigs())}) or a model ({error.allowed})"
+        allowed = f"a recording, a capture folder, a rig ({', '.join(known_rigs())}) or a model ({error.allowed})"
         raise ConfigError("nothing to describe has this name", value=name, allowed=allowed) from error
 
 
@@ -83,8 +112,9 @@ def describe_rig(rig: Rig) -> list[str]:
     """Lines for people: radars with derived figures, then every rule with formula, measured value and limit."""
     lines = [f"rig {rig.name}: {rig.description}", ""]
     for name, radar in rig.radars.items():
-        layout = radar.schedule.layout
-        lines.append(f"{name}: {radar.schedule.profile.device}, {layout.slots} TX x {layout.devices * layout.rx} RX")
+        chip = radar.schedule.profile.chip
+        real = "" if chip.complex_samples else "; its real samples are not imaged"
+        lines.append(f"{name}: {chip.name}, {radar.schedule.slots} TX x {chip.chips * chip.rx} RX{real}")
         lines += [f"  {key:<18}{value:10.4g} {unit}" for key, (value, unit) in schedule_figures(radar.schedule).items()]
     lines += ["", format_table(rig.constraints())]
     return lines

@@ -15,13 +15,13 @@ from edge.sources.base import FrameSource
 
 def add_rig_arguments(parser: argparse.ArgumentParser) -> None:
     """``--rig`` and ``--calibration``."""
-    parser.add_argument("--rig", help="rig name or folder; a recording brings its own")
+    parser.add_argument("--rig", help="name or folder; a recording brings its own")
     parser.add_argument(
         "--calibration",
         action="append",
         default=[],
-        metavar="[RADAR=]FILE",
-        help="calibration (.npz, or TI's .mat) instead of the rig's; may be repeated",
+        metavar="FILE",
+        help="[RADAR=]FILE (.npz, TI's .mat) instead of the rig's",
     )
 
 

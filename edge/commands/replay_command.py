@@ -34,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
         raise RecordingError(f"{path}: no such recording", action="give an .mcap file or a capture folder")
     with RecordingReader(path) as reader:
         rig = calibrated(load_rig(args.rig) if args.rig else reader.read_rig(), args.calibration)
-        notes = [f"{path}: its end is missing; played up to the last whole record"] if reader.truncated else []
+        notes = list(reader.notes)
+        if reader.truncated:
+            notes.append(f"{path}: its end is missing; played up to the last whole record")
         return _play(session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes), reader)
 
 

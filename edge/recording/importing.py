@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edge.constraints import start_offset_s
 from edge.errors import CaptureError, PoseError
 from edge.frames import LossCause, Pose, RadarFrame, RadarId
 from edge.odometry.recorded import read_poses
@@ -49,12 +50,15 @@ def open_captures(
 ) -> dict[RadarId, CaptureFile]:
     """One source for each radar of the rig.
 
+    Two boards' clocks have nothing in common: in a rig of two radars their first frames are taken for one pair, and the
+    vertical radar's time is the horizontal one's plus ``constraints.start_offset_s``, half a period for equal bursts.
+
     Args:
         captures: radar -> TI capture folder or ``adc_data.bin``; a single path is the capture of a rig of one radar, or
             a folder that holds ``horizontal`` and ``vertical``.
         rig: rig the captures were made with.
-        t_start_ns: instant of every radar's first frame; None keeps a board's own clock in a rig of one radar, and
-            starts both at 0 in a rig of two: two boards' clocks have nothing in common.
+        t_start_ns: instant of the horizontal (or only) radar's first chirp; None keeps a board's own clock in a rig of
+            one radar, 0 where the capture has none, and is 0 in a rig of two.
     Raises:
         CaptureError: a radar of the rig has no capture, or as CaptureFolder and Dca1000File.
     """
@@ -68,9 +72,11 @@ def open_captures(
             allowed=", ".join(rig.radars),
             action="give one capture for each radar of the rig",
         )
-    if len(captures) > 1 and t_start_ns is None:
-        t_start_ns = 0
-    return {radar: _open(path, rig, radar, t_start_ns) for radar, path in captures.items()}
+    starts_ns: dict[RadarId, int | None] = dict.fromkeys(captures, t_start_ns)
+    if len(captures) > 1:
+        horizontal_ns = t_start_ns or 0
+        starts_ns = {"horizontal": horizontal_ns, "vertical": horizontal_ns + _offset_ns(rig)}
+    return {radar: _open(path, rig, radar, starts_ns[radar]) for radar, path in captures.items()}
 
 
 def import_capture(
@@ -84,9 +90,9 @@ def import_capture(
     """Write captures and poses to one recording, in time order.
 
     Args:
-        captures, rig, t_start_ns: as for ``open_captures``.
+        captures, rig, t_start_ns: as for ``open_captures``. The notes of the report are stored with the recording.
         out_path: recording to make; must not exist.
-        poses: ascending in time, on the clock of the frames.
+        poses: of the rig, ascending in time, on the clock of the frames, which ``t_start_ns`` sets.
         progress: called with frames done and frames in all.
     Raises:
         CaptureError: as ``open_captures``.
@@ -102,7 +108,12 @@ def import_capture(
             report.notes += [f"{radar}: {note}" for note in source.notes]
         if isinstance(source, CaptureFolder):
             report.notes += [f"{radar}: {name} is dead" for name in source.dead_channels()]
-    writer = RecordingWriter(out_path, rig)
+    if len(sources) > 1:
+        report.notes.append(
+            f"assumed, not measured: the captures begin with frames of one number, the vertical radar's"
+            f" {_offset_ns(rig) / 1e6:.3f} ms after the horizontal one's at {t_start_ns or 0} ns"
+        )
+    writer = RecordingWriter(out_path, rig, report.notes)
     try:
         with writer:
             _copy(sources, poses, writer, report, progress)
@@ -159,9 +170,13 @@ def _copy(
             progress(done, total)
 
 
+def _offset_ns(rig: Rig) -> int:
+    return round(1e9 * start_offset_s(rig.radars["horizontal"].schedule, rig.radars["vertical"].schedule))
+
+
 def _open(path: Path, rig: Rig, radar: RadarId, t_start_ns: int | None) -> CaptureFile:
     if LoopSum.is_at(path):
-        return LoopSum(path, rig, radar)
+        return LoopSum(path, rig, radar, t_start_ns or 0)
     if rig.radars[radar].schedule.layout.kind == "cascade":
         return CaptureFolder(path, rig, radar, t_start_ns)
     paths = sorted(path.glob("*.bin"), key=_card_order) if path.is_dir() else [path]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
 from collections import Counter
@@ -30,6 +31,7 @@ class RecordingReader:
         truncated: the file lacks its end: it was cut, its writer died, or its end is damaged.
         rig_name: of the rig that recorded; empty when the file was cut before it.
         config_hash: of that rig.
+        notes: what whoever recorded or imported wanted a reader to know.
         report: what the newest pass over the file found so far.
     Raises:
         RecordingError: unreadable, no MCAP file, or not one of ours.
@@ -48,6 +50,7 @@ class RecordingReader:
         self.rig_name = self._metadata.get("rig", "")
         hexadecimal = self._metadata.get("config_hash", "")
         self.config_hash = bytes.fromhex(hexadecimal) if re.fullmatch("([0-9a-f]{2})*", hexadecimal) else b""
+        self.notes = _texts(self._metadata.get("notes", "[]"))
         self.report = ReadReport()
         self._counts: dict[str, int] | None = None
         self._span_ns: tuple[int, int] | None = None
@@ -105,6 +108,7 @@ class RecordingReader:
             "rig": self.rig_name,
             "config_hash": self.config_hash.hex(),
             "host": self._metadata.get("host", ""),
+            "notes": self.notes,
             "bytes": self._mcap.size,
             "truncated": self.truncated,
             "bytes_lost": self.report.bytes_lost,
@@ -188,6 +192,15 @@ class RecordingReader:
             last = max(last, message.log_time_ns)
         self._counts, self._span_ns = dict(counts), (first or 0, last)
         return self._counts, self._span_ns
+
+
+def _texts(stored: str) -> list[str]:
+    """A list of sentences from JSON; whatever else it is gives none."""
+    try:
+        values = json.loads(stored)
+    except (ValueError, RecursionError):
+        return []
+    return [value for value in values if isinstance(value, str)] if isinstance(values, list) else []
 
 
 def _is_file_name(name: str) -> bool:

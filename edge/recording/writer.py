@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 import platform
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -35,13 +36,14 @@ class RecordingWriter:
     Args:
         path: must not exist; the folder must.
         rig: its folder and calibrations are stored with the data.
+        notes: what a reader of the data should know, in sentences; stored, and shown by a replay.
     Raises:
         RecordingError: the file exists or cannot be written; the disk is full, now or in any later call. What was
             written before stays readable.
     """
 
-    def __init__(self, path: Path | str, rig: Rig) -> None:
-        self.path, self.rig = Path(path), rig
+    def __init__(self, path: Path | str, rig: Rig, notes: Sequence[str] = ()) -> None:
+        self.path, self.rig, self._notes = Path(path), rig, list(notes)
         self._layouts = {radar: one.schedule.layout for radar, one in rig.radars.items()}
         self._lock = threading.Lock()
         self._failure = ""
@@ -133,6 +135,7 @@ class RecordingWriter:
                 "config_hash": self.rig.config_hash.hex(),
                 "host": platform.node(),
                 "utc_minus_monotonic_ns": str(time.time_ns() - time.monotonic_ns()),
+                "notes": json.dumps(self._notes),
             },
         )
         for name, content in _attachments(self.rig).items():

@@ -17,6 +17,7 @@ from edge.frames import Pose, RadarFrame, RadarId
 from edge.reference.repack import split_loop_sum
 from edge.rig import Rig
 from edge.sources.base import Loss
+from edge.sources.ti_index import gap_notes, indexed_gaps
 
 FILE_NAME = "adc_loop_sum.npz"
 ARRAY = "adc_loop_sum"
@@ -32,11 +33,15 @@ class LoopSum:
             ``slope_hz_per_s``, ``sample_rate_hz``.
         rig: rig it was captured with.
         radar: which of its radars.
+        t_start_ns: instant of the frame.
+    Attributes:
+        notes: what a reader of the results should know: the re-packing, and gaps of the capture when its index files
+            lie beside.
     Raises:
-        CaptureError: not such a file, or it contradicts the schedule.
+        CaptureError: not such a file, it contradicts the schedule, or an index file that cannot be read.
     """
 
-    def __init__(self, path: Path, rig: Rig, radar: RadarId) -> None:
+    def __init__(self, path: Path, rig: Rig, radar: RadarId, t_start_ns: int = 0) -> None:
         schedule = rig.radars[radar].schedule
         file = path / FILE_NAME
         try:
@@ -60,8 +65,8 @@ class LoopSum:
                 allowed=f"{expected}: loops, TX, RX, samples, I and Q, slope in MHz/ms, sample rate in kHz",
                 action="give the rig it was captured with (--rig)",
             )
-        self._frame = RadarFrame(radar, 0, 0, split_loop_sum(total, loops), layout)
-        self.notes = [NOTE]
+        self._frame = RadarFrame(radar, 0, t_start_ns, split_loop_sum(total, loops), layout)
+        self.notes = [NOTE, *(f"the capture it is from has {note}" for note in gap_notes(indexed_gaps(path)))]
 
     @staticmethod
     def is_at(path: Path) -> bool:
@@ -74,7 +79,7 @@ class LoopSum:
         return 1
 
     def __iter__(self) -> Iterator[RadarFrame | Pose | Loss]:
-        """The frame, at instant 0."""
+        """The frame."""
         yield self._frame
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ from edge.errors import CaptureError
 from edge.frames import Layout, LossCause, Pose, RadarFrame, RadarId
 from edge.rig import Radar, Rig
 from edge.sources.base import Loss, file_size, loops_that_fit, open_raw, read_into
-from edge.sources.ti_index import GAP_TOLERANCE, CaptureIndex, Gap, find_gaps, read_index
+from edge.sources.ti_index import GAP_TOLERANCE, CaptureIndex, Gap, describe_indexes, find_gaps, gap_notes, read_index
 
 DEVICES = ("master", "slave1", "slave2", "slave3")
 SAME_FRAME_NS = 1_000_000
@@ -196,12 +196,36 @@ class CaptureFolder:
             self.notes.append(f"frames came every {1e3 * measured_s:.2f} ms, the schedule says {1e3 * period_s:.2f} ms")
             period_s = measured_s if measured_s > 0 else period_s
         self.gaps = find_gaps(t_ns, period_s)
-        self.notes += [f"{1e3 * g.duration_s:.2f} ms between frames {g.after} and {g.after + 1}" for g in self.gaps]
+        self.notes += gap_notes(self.gaps)
         advance = np.ones(total, dtype=np.int64)
         advance[0] = 0
         for gap in self.gaps:
             advance[gap.after + 1] += gap.missing
         return t_ns if t_start_ns is None else t_ns - t_ns[0] + t_start_ns, np.cumsum(advance)
+
+
+def describe_capture(folder: Path) -> dict[str, object]:
+    """What the files of a capture folder say without a rig: devices, bytes of their data, frames, period, gaps.
+
+    Returns:
+        Plain values for JSON; empty when the folder holds no file of the capture board.
+    Raises:
+        CaptureError: an index that cannot be read.
+    """
+    names = [path.name for path in sorted(folder.iterdir())] if folder.is_dir() else []
+    files = [match for match in map(_FILE.fullmatch, names) if match]
+    if not files:
+        return {}
+    data = {match[0]: file_size(folder / match[0]) for match in files if match[3] == "data"}
+    found: dict[str, object] = {
+        "capture": str(folder),
+        "devices": [device for device in DEVICES if any(match[1] == device for match in files)],
+    }
+    if data:
+        found["data_bytes"] = data
+    if any(match[1] == DEVICES[0] and match[3] == "idx" for match in files):
+        return found | describe_indexes(folder)
+    return found | {"frames": "unknown without index files: their size follows from the rig"}
 
 
 def _radar_of(rig: Rig, radar: RadarId, path: Path) -> Radar:

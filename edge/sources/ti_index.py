@@ -117,6 +117,22 @@ def find_gaps(t_ns: Sequence[int] | NDArray[np.int64], period_s: float) -> list[
     return [Gap(i, s, max(0, round(s / period_s) - 1)) for i, s in enumerate(steps_s) if s > allowed_s]
 
 
+def gap_notes(gaps: Sequence[Gap]) -> list[str]:
+    """One phrase a gap: "124.65 ms between frames 6 and 7"."""
+    return [f"{1e3 * gap.duration_s:.2f} ms between frames {gap.after} and {gap.after + 1}" for gap in gaps]
+
+
+def indexed_gaps(folder: Path) -> list[Gap]:
+    """Gaps against the median period that the master's index files of a folder show; none without index.
+
+    Raises:
+        CaptureError: an index that cannot be read.
+    """
+    _, t_ns = _master_indexes(folder)
+    period_s = _median_period_s(t_ns)
+    return find_gaps(t_ns, period_s) if period_s > 0 else []
+
+
 def describe_indexes(folder: Path) -> dict[str, object]:
     """What the index files of a capture folder say, with or without the data files beside them.
 
@@ -125,13 +141,11 @@ def describe_indexes(folder: Path) -> dict[str, object]:
     Raises:
         CaptureError: no index there, or one that cannot be read.
     """
-    indexes = [read_index(path) for path in sorted(folder.glob("master_[0-9][0-9][0-9][0-9]_idx.bin"))]
+    indexes, t_ns = _master_indexes(folder)
     if not indexes:
         raise CaptureError(f"{folder} holds no master_0000_idx.bin", action="give the folder the board wrote")
-    t_ns = np.concatenate([index.t_ns for index in indexes])
     size = np.concatenate([index.size for index in indexes])
-    period_s = float(np.median(np.diff(t_ns))) / 1e9 if len(t_ns) > 1 else 0.0
-    gaps = find_gaps(t_ns, period_s) if period_s > 0 else []
+    period_s, gaps = _median_period_s(t_ns), indexed_gaps(folder)
     return {
         "frames": len(t_ns),
         "device_frame_bytes": sorted(set(size.tolist())),
@@ -139,6 +153,16 @@ def describe_indexes(folder: Path) -> dict[str, object]:
         "duration_s": float(t_ns[-1] - t_ns[0]) / 1e9 if len(t_ns) else 0.0,
         "gaps": [{"after_frame": g.after, "duration_s": g.duration_s, "frames_missing": g.missing} for g in gaps],
     }
+
+
+def _master_indexes(folder: Path) -> tuple[list[CaptureIndex], NDArray[np.int64]]:
+    """The master's index of every segment, and all instants."""
+    indexes = [read_index(path) for path in sorted(folder.glob("master_[0-9][0-9][0-9][0-9]_idx.bin"))]
+    return indexes, np.concatenate([index.t_ns for index in indexes] or [np.zeros(0, dtype=np.int64)])
+
+
+def _median_period_s(t_ns: NDArray[np.int64]) -> float:
+    return float(np.median(np.diff(t_ns))) / 1e9 if len(t_ns) > 1 else 0.0
 
 
 def _checked(path: Path, entries: NDArray[np.void], data_bytes: int) -> CaptureIndex:

@@ -16,6 +16,7 @@ from cli_run import rfconstruct, write_recording
 from edge import cli
 from edge.commands import info_command
 from edge.errors import ExitCode
+from edge.rig import known_rigs
 
 RADAR_VERBS = ("demo", "replay", "listen", "import", "info", "bench")
 USAGE = [
@@ -33,6 +34,9 @@ USAGE = [
     ("bench", "--seconds", "inf"),
     ("bench", "--seconds", "-1"),
     ("import", "x"),
+    ("import", "x", "--rig", "corridor", "--out", "o", "--start-ns", "-1"),
+    ("import", "x", "--rig", "corridor", "--out", "o", "--start-ns", "99999999999999999999"),
+    ("import", "x", "--rig", "corridor", "--out", "o", "--poses-of", "wheel"),
     ("info",),
 ]
 REFUSED = [
@@ -64,7 +68,7 @@ REFUSED = [
     (("import", "{tmp}", "--rig", "corridor", "--out", "{tmp}/text.mcap"), 5, "nothing is overwritten"),
     (("import", "{tmp}", "--rig", "corridor", "--poses", "{tmp}/no.csv", "--out", "{tmp}/o.mcap"), 1, "no.csv"),
     (("import", "{tmp}/no.mat", "--rig", "corridor", "--out", "{tmp}/o.npz"), 5, "no such calibration"),
-    (("info", "nothing"), 5, "a recording, a rig (awr1843_pair"),
+    (("info", "nothing"), 5, "a recording, a capture folder, a rig (awr1843_pair"),
     (("info", "{tmp}/text.mcap"), 1, "no MCAP file"),
     (("info", "{tmp}"), 5, "or a model (default"),
     (("bench", "--rig", "corridor"), 5, "two cascade radars"),
@@ -197,3 +201,10 @@ def test_rigs_and_models_are_described() -> None:
     assert {rule["severity"] for rule in rig["rules"]} <= {"error", "warning", "info"}
     assert rfconstruct("info", "default", "--json").json["model"] == "default"
     assert "T - slots L Tc" in rfconstruct("info", "corridor").out
+
+
+@pytest.mark.parametrize("name", known_rigs())
+def test_every_shipped_rig_can_be_described(name: str) -> None:
+    outcome = rfconstruct("info", name)
+    assert outcome.code == ExitCode.OK
+    assert ("real samples are not imaged" in outcome.out) == (name == "awr2944_pair")

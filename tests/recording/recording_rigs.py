@@ -27,7 +27,8 @@ def small_rig(folder: Path, layout: Layout = LAYOUT, radars: Sequence[RadarId] =
     """Two radars with tiny frames; no board is like this, so it is no rig.toml of ours."""
     folder.mkdir(exist_ok=True)
     (folder / "rig.toml").write_text('description = "small"\n')
-    schedule = SimpleNamespace(layout=layout, frame_period_s=0.02, packed_12_bit=False)
+    times = {"frame_period_s": 0.02, "frame_period_s_actual": 0.02, "burst_s": 0.004}
+    schedule = SimpleNamespace(layout=layout, packed_12_bit=False, **times)
     radar = SimpleNamespace(schedule=schedule, calibration=Calibration.identity(layout))
     return SimpleNamespace(
         name=folder.name, radars=dict.fromkeys(radars, radar), directory=folder, config_hash=bytes(range(8))

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_rigs import BIG, LAYOUT, pose, small_rig
 
+from edge.constraints import start_offset_s
 from edge.errors import CaptureError, PoseError, RecordingError
 from edge.frames import RADARS, LossCause, Pose, RadarFrame
 from edge.recording.importing import ImportReport, import_capture, import_poses, open_captures
@@ -77,8 +78,10 @@ def test_two_radars_with_poses_in_time_order(tmp_path: Path, as_mapping: bool) -
     assert report.lost["vertical"] == {LossCause.TRUNCATED: 1}
     assert report.poses == 7
     assert "vertical: slave2 RX1 is dead" in report.notes
+    assert "assumed, not measured" in report.notes[-1]
     with RecordingReader(tmp_path / "a.mcap") as reader:
         items = list(reader)
+        assert reader.notes == report.notes
     times = [x.t_first_chirp_ns if isinstance(x, RadarFrame) else x.t_ns for x in items]
     assert times == sorted(times)
     pairer = FramePairer(RADARS)
@@ -91,6 +94,36 @@ def test_two_radars_with_poses_in_time_order(tmp_path: Path, as_mapping: bool) -
     pairer.flush()
     for ledger in pairer.ledgers.values():
         ledger.check()
+
+
+@pytest.mark.parametrize("start_ns", [None, 7_000_000_000])
+def test_the_vertical_radar_starts_half_a_period_later(tmp_path: Path, start_ns: int | None) -> None:
+    rig = small_rig(tmp_path / "rig", BIG)
+    for k, radar in enumerate(RADARS):
+        write_ti(tmp_path / radar, samples(3, BIG.shape, k))
+    report = import_capture(tmp_path, rig, tmp_path / "a.mcap", t_start_ns=start_ns)
+    with RecordingReader(tmp_path / "a.mcap") as reader:
+        frames = [x for x in reader if isinstance(x, RadarFrame)]
+    for radar, offset_ns in (("horizontal", 0), ("vertical", PERIOD_NS // 2)):
+        times = [x.t_first_chirp_ns - (start_ns or 0) for x in frames if x.radar == radar]
+        assert times == [k * PERIOD_NS + offset_ns for k in range(3)]
+    assert "10.000 ms after the horizontal" in report.notes[-1]
+
+
+def test_the_shipped_pairs_offset_is_half_a_period() -> None:
+    rig = load_rig("cascade_pair")
+    schedules = [rig.radars[radar].schedule for radar in RADARS]
+    assert start_offset_s(*schedules) == pytest.approx(schedules[0].frame_period_s_actual / 2, abs=1e-9)
+
+
+def test_a_sum_over_loops_says_where_its_capture_had_a_gap(radar_data: Path, tmp_path: Path) -> None:
+    rig, folder = load_rig("corridor"), radar_data / "cascade_corridor_svenningsson"
+    report = import_capture(folder, rig, tmp_path / "a.mcap", t_start_ns=5)
+    assert report.notes[1] == "horizontal: the capture it is from has 124.65 ms between frames 6 and 7"
+    with RecordingReader(tmp_path / "a.mcap") as reader:
+        assert reader.notes == report.notes
+        assert reader.info()["notes"] == report.notes
+        assert [x.t_first_chirp_ns for x in reader if isinstance(x, RadarFrame)] == [5]
 
 
 def test_dca1000_files_in_the_cards_order(tmp_path: Path) -> None:

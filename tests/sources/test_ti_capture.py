@@ -98,6 +98,7 @@ def test_real_index_with_its_gap(radar_data: Path, tmp_path: Path) -> None:
     source = CaptureFolder(tmp_path, load_rig("corridor"), "horizontal")
     assert source.total_frames == 8
     assert [(g.after, round(g.duration_s * 1e3, 3)) for g in source.gaps] == [(6, 124.65)]
+    assert "124.65 ms between frames 6 and 7" in source.notes
     assert any("124.65 ms between frames 6 and 7" in note for note in source.notes)
     with pytest.raises(CaptureError, match=r"master_0000_data\.bin is missing"):
         CaptureFolder(radar_data / "cascade_corridor_svenningsson", load_rig("corridor"), "horizontal")

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import CaptureError
-from edge.sources.ti_index import describe_indexes, find_gaps, read_index
+from edge.sources.ti_capture import describe_capture
+from edge.sources.ti_index import describe_indexes, find_gaps, gap_notes, indexed_gaps, read_index
 
 CORRIDOR = "cascade_corridor_svenningsson"
 
@@ -46,6 +47,23 @@ def test_real_folder_without_data_files(radar_data: Path) -> None:
     assert report["device_frame_bytes"] == [3_145_728]
     assert report["period_s"] == pytest.approx(0.099997, abs=1e-6)
     assert report["gaps"] == [{"after_frame": 6, "duration_s": pytest.approx(0.12465), "frames_missing": 0}]
+
+
+def test_real_folder_described(radar_data: Path) -> None:
+    content = describe_capture(radar_data / CORRIDOR)
+    assert content["devices"] == ["master", "slave1", "slave2", "slave3"]
+    assert "data_bytes" not in content
+    assert content["frames"] == 8
+    assert gap_notes(indexed_gaps(radar_data / CORRIDOR)) == ["124.65 ms between frames 6 and 7"]
+
+
+def test_folders_without_index_or_capture(tmp_path: Path) -> None:
+    assert describe_capture(tmp_path) == describe_capture(tmp_path / "none") == {}
+    assert indexed_gaps(tmp_path) == []
+    (tmp_path / "slave2_0000_data.bin").write_bytes(bytes(12))
+    content = describe_capture(tmp_path)
+    assert (content["devices"], content["data_bytes"]) == (["slave2"], {"slave2_0000_data.bin": 12})
+    assert "rig" in str(content["frames"])
 
 
 def test_gaps_count_missing_periods() -> None:
