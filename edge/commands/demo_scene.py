@@ -23,6 +23,8 @@ from edge.resources import data_dir
 from edge.rig import Rig
 
 SCENE = DriveBy()
+KEPT_RECORDINGS = 3
+"""Newest ones of one object that stay in the cache; other objects' are not touched."""
 TRUTH_POINTS = 16384
 COLLECTED_CAR = Path("objects") / "car" / "c1280_sedan.npz"
 COLLECTED_CREDIT = '"Generic passenger car pack" by Comrade1280, CC-BY-4.0; the model was not trained on this author'
@@ -81,17 +83,19 @@ def demo_recording(rig: Rig, thing: DemoObject, scene: DriveBy) -> Path:
     Raises:
         CaptureError: the cache cannot be written.
     """
+    owner = hashlib.sha256(thing.credit.encode()).hexdigest()[:8]
     key = hashlib.sha256(repr(scene).encode() + rig.config_hash + thing.vertices_odom_m.tobytes()).hexdigest()[:16]
-    path = cache_dir() / f"demo-{key}.mcap"
+    path = cache_dir() / f"demo-{owner}-{key}.mcap"
     if path.is_file():
         return path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for stale in path.parent.glob("demo-*.mcap"):
-            stale.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             _record(Path(folder) / path.name, rig, thing, scene)
             (Path(folder) / path.name).replace(path)
+        ages = {file: file.stat().st_mtime_ns for file in path.parent.glob(f"demo-{owner}-*.mcap")}
+        for stale in sorted(ages, key=lambda file: ages[file])[:-KEPT_RECORDINGS]:
+            stale.unlink(missing_ok=True)
     except OSError as error:
         raise CaptureError(
             f"the demo's recording cannot be written ({error.strerror})",

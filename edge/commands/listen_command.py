@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -30,25 +32,35 @@ DEFAULT_TOPICS = ("shape", "cloud", "status")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="address of the publisher (%(default)s)")
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="address of the publisher (default: %(default)s)")
     parser.add_argument(
         "--topic", action="append", type=topic, help=f"{', '.join(TOPICS)} (default: {', '.join(DEFAULT_TOPICS)})"
     )
-    parser.add_argument("--save", type=Path, metavar="DIR", help="write every shape as PLY")
+    parser.add_argument("--save", type=Path, metavar="DIR", help="write every shape there as PLY; overwrites nothing")
     parser.add_argument("--count", type=arguments.count, help="end after so many messages")
-    parser.add_argument("--timeout", type=arguments.seconds, metavar="SECONDS", help="end after so long a silence")
+    parser.add_argument(
+        "--timeout",
+        type=arguments.seconds,
+        metavar="SECONDS",
+        help="end after so long a silence; exit code 3 when nothing came at all",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print until interrupted, until ``--count`` or until the silence of ``--timeout``; exit code 3 when that came."""
+    """Print until interrupted, until ``--count`` or until the silence of ``--timeout``.
+
+    Exit code 3 when ``--timeout`` passed without any message, or before ``--count`` of them.
+    """
     if args.save is not None:
         _make_folder(args.save)
     with connect(args.endpoint, args.topic or DEFAULT_TOPICS, args.timeout) as client:
+        if not args.json:
+            print(f"waiting for {args.endpoint}", file=sys.stderr, flush=True)
         try:
             seen = _print_messages(client, args)
         finally:
             _print_account(client)
-    return ExitCode.OK if args.count is None or seen >= args.count else ExitCode.DEGRADED
+    return ExitCode.OK if seen >= (args.count or 1) else ExitCode.DEGRADED
 
 
 def topic(text: str) -> str:
@@ -75,11 +87,22 @@ def _print_messages(client: Client, args: argparse.Namespace) -> int:
             kind = content.pop("type")
             print(f"{kind:<11}" + "  ".join(f"{key} {value}" for key, value in content.items()), flush=True)
         if args.save is not None and isinstance(message, ShapeMessage):
-            save_shape(args.save / f"shape_{message.identity}_{message.header.sequence}.ply", message)
+            save_shape(free_path(args.save, message), message)
         seen += 1
         if args.count is not None and seen >= args.count:
             break
     return seen
+
+
+def free_path(folder: Path, message: ShapeMessage) -> Path:
+    """Name of a file that does not exist: start of the publisher, class, identity, instant and number in its topic.
+
+    ``shape_00010203_car_5_1000000000_7.ply``; a number follows when there is such a file (two listeners, one folder).
+    """
+    head, kind = message.header, re.sub(r"[^A-Za-z0-9-]", "-", message.class_name)[:40]
+    name = f"shape_{head.boot.hex()[:8]}_{kind}_{message.identity}_{head.t_ns}_{head.sequence}"
+    names = itertools.chain([name], (f"{name}_{copy}" for copy in itertools.count(2)))
+    return next(path for name in names if not (path := folder / f"{name}.ply").exists())
 
 
 def _print_account(client: Client) -> None:

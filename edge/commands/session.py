@@ -34,7 +34,7 @@ JOIN_S = 1.2
 
 def add_arguments(parser: argparse.ArgumentParser, speed: str) -> None:
     """Options that both verbs have."""
-    help_text = "1 = as recorded, 2 = twice as fast, max = as fast as it goes (%(default)s)"
+    help_text = "1 = as recorded, 2 = twice as fast, max = as fast as it goes (default: %(default)s)"
     parser.add_argument("--speed", type=arguments.speed, default=speed, help=help_text)
     parser.add_argument("--plot", type=Path, metavar="DIR", help="write pictures there (extra 'plot')")
     parser.add_argument("--endpoint", action="append", metavar="ADDRESS", help="publish there instead of the rig's")

@@ -79,7 +79,9 @@ class Client:
         except zmq.ZMQError as error:
             self.close()
             raise ConfigError(
-                f"cannot connect ({error.strerror})", value=endpoint, allowed="tcp://HOST:PORT or ipc:///PATH"
+                f"cannot connect ({zmq.strerror(error.errno or 0)})",
+                value=endpoint,
+                allowed="tcp://HOST:PORT or ipc:///PATH",
             ) from error
 
     @property

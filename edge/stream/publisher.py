@@ -244,7 +244,7 @@ def _bind(sender: zmq.Socket[bytes], endpoint: str) -> str:
         sender.bind(endpoint)
     except zmq.ZMQError as error:
         raise ConfigError(
-            f"setting stream.endpoints: {endpoint} cannot be bound ({error.strerror})",
+            f"setting stream.endpoints: address cannot be bound ({zmq.strerror(error.errno or 0)})",
             value=endpoint,
             action="stop the other publisher or set another address"
             if error.errno == zmq.EADDRINUSE

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from cli_run import rfconstruct
 from edge.commands import demo_command, demo_scene
 from edge.errors import ExitCode
 from edge.reference.drive_by import DriveBy
+from edge.rig import load_rig
 
 SHORT = DriveBy(frames=30, frame_period_s=0.2, scatterers=300)
 """Half the frames over the same travel."""
@@ -40,6 +43,22 @@ def test_the_demo_runs_twice_and_makes_its_recording_once(tmp_path: Path, monkey
     assert 0 < content["radar_points_to_truth_chamfer_cm"] < 200
     assert content["frames"]["vertical"]["frames_ok"] == SHORT.frames
     assert f"associated points: {content['points']};" in first.out
+
+
+def test_the_cache_keeps_a_few_recordings_and_all_of_other_objects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(demo_scene, "_record", lambda path, rig, thing, scene: path.write_bytes(b"recording"))
+    rig, thing = load_rig("cascade_demo"), demo_scene.demo_object()
+    other = demo_scene.demo_recording(rig, replace(thing, credit="another object"), SHORT)
+    os.utime(other, ns=(1, 1))
+    made = []
+    for number in range(demo_scene.KEPT_RECORDINGS + 2):
+        made.append(demo_scene.demo_recording(rig, thing, replace(SHORT, scatterers=100 + number)))
+        os.utime(made[-1], ns=(number + 2, number + 2))
+    assert other.is_file()
+    assert [path.is_file() for path in made] == [False] * 2 + [True] * demo_scene.KEPT_RECORDINGS
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

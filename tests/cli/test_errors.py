@@ -191,8 +191,22 @@ def test_nobody_reads_the_output(stdout: str, code: int) -> None:
 
 def test_silence_ends_listening() -> None:
     endpoint = ("--endpoint", "tcp://127.0.0.1:1", "--timeout", "0.1")
-    assert rfconstruct("listen", *endpoint).code == ExitCode.OK
+    told = rfconstruct("listen", *endpoint)
+    assert (told.code, told.out, told.err) == (ExitCode.DEGRADED, "", "waiting for tcp://127.0.0.1:1\n")
     assert rfconstruct("listen", "--count", "1", *endpoint).code == ExitCode.DEGRADED
+    as_json = rfconstruct("listen", "--json", *endpoint)
+    assert (as_json.code, as_json.out, as_json.err) == (ExitCode.DEGRADED, "", "")
+
+
+def test_an_address_in_use_is_named_once(taken_port: int, places: dict[str, str]) -> None:
+    told = rfconstruct("replay", places["rec"], "--endpoint", f"tcp://127.0.0.1:{taken_port}").err
+    assert told.count(f"127.0.0.1:{taken_port}") == 1
+    assert "Address already in use" in told
+
+
+@pytest.mark.parametrize(("verb", "default"), [("replay", "1"), ("demo", "1"), ("listen", "tcp://127.0.0.1:5600")])
+def test_defaults_are_called_so(verb: str, default: str) -> None:
+    assert f"(default: {default})" in " ".join(rfconstruct(verb, "--help").out.split())
 
 
 def test_rigs_and_models_are_described() -> None:

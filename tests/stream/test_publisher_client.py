@@ -16,61 +16,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zmq
 from stream_samples import STAMP, detections, fused_cloud, heatmap, point_cloud, pose, shape, status
+from stream_sockets import LOCAL, WAIT_S, Raw, client_messages, poses, publisher, subscribed
 
 from edge import connect
 from edge.config import StreamSettings
-from edge.errors import ConfigError, ExitCode
-from edge.stream.client import Client
+from edge.errors import ConfigError
 from edge.stream.convert import encode_heartbeat, encode_pose
-from edge.stream.messages import HeartbeatMessage, PoseMessage, ShapeMessage, StatusMessage
-from edge.stream.publisher import Publisher, _Pace, checked_endpoint
+from edge.stream.messages import PoseMessage, ShapeMessage, StatusMessage
+from edge.stream.publisher import _Pace
 from edge.stream.wire import join, pack, split
-
-LOCAL = StreamSettings(("tcp://127.0.0.1:*",))
-WAIT_S = 20.0
-"""Upper bound of waits that normally take milliseconds."""
-
-
-def publisher(settings: StreamSettings = LOCAL) -> Publisher:
-    return Publisher(settings, b"configuration", b"calibration", "sim")
-
-
-def subscribed(sender: Publisher, *topics: str, latest: bool = False) -> Client:
-    """A client whose subscription has reached the publisher."""
-    client = connect(sender.endpoints[0], topics=topics, timeout_s=WAIT_S, latest=latest)
-    deadline = time.monotonic() + WAIT_S
-    while not client.alive and time.monotonic() < deadline:
-        sender.heartbeat()
-        time.sleep(0.005)
-    assert client.alive
-    return client
-
-
-class Raw:
-    """A bare PUB socket, to send what a publisher never would."""
-
-    def __init__(self) -> None:
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.PUB)
-        self._socket.bind("tcp://127.0.0.1:*")
-        self.endpoints = (self._socket.getsockopt_string(zmq.LAST_ENDPOINT),)
-        self._beats = 0
-
-    def heartbeat(self) -> None:
-        self.send(pack(encode_heartbeat("RUN", 1), replace(STAMP, sequence=self._beats)))
-        self._beats += 1
-
-    def send(self, frames: list[bytes]) -> None:
-        self._socket.send_multipart(frames)
-
-    def pose(self, sequence: int, boot: bytes = STAMP.boot) -> None:
-        self.send(pack(encode_pose(pose()), replace(STAMP, sequence=sequence, boot=boot)))
-
-    def close(self) -> None:
-        self._socket.close(linger=0)
-        self._context.term()
 
 
 @pytest.fixture
@@ -78,17 +33,6 @@ def raw() -> Iterator[Raw]:
     sender = Raw()
     yield sender
     sender.close()
-
-
-def poses(client: Client, count: int) -> list[int]:
-    """Sequence numbers of the next ``count`` poses."""
-    found: list[int] = []
-    while len(found) < count:
-        message = client.recv(WAIT_S)
-        assert message is not None
-        if isinstance(message, PoseMessage):
-            found.append(message.header.sequence)
-    return found
 
 
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
@@ -115,17 +59,6 @@ def test_every_kind_of_message_arrives(transport: str, tmp_path: Path) -> None:
         "StatusMessage",
     ]
     assert all(split(join(frames)) == frames for frames in sent)
-
-
-def client_messages(client: Client, count: int) -> list[object]:
-    """The next messages that are no heartbeats."""
-    found: list[object] = []
-    for message in client:
-        if not isinstance(message, HeartbeatMessage):
-            found.append(message)
-        if len(found) == count:
-            break
-    return found
 
 
 def test_shape_arrives_bit_for_bit_and_sequences_count_by_topic() -> None:
@@ -313,70 +246,6 @@ def test_nobody_there_is_no_error_and_no_hang() -> None:
     assert client.recv(1.0) is None
     with pytest.raises(ConfigError, match="connect"):
         connect("carrier pigeon")
-
-
-@pytest.mark.parametrize(
-    "endpoint", ["tcp://127.0.0.1:5600", "tcp://[::1]:1", "tcp://127.0.0.9:*", "ipc:///run/rfc/pub"]
-)
-def test_addresses_of_this_machine(endpoint: str) -> None:
-    assert checked_endpoint(endpoint) == endpoint
-    assert checked_endpoint("tcp://localhost:5600") == "tcp://127.0.0.1:5600"
-
-
-@pytest.mark.parametrize(
-    "endpoint",
-    [
-        "tcp://0.0.0.0:5600",
-        "tcp://*:5600",
-        "tcp://192.168.0.2:5600",
-        "tcp://[::]:5600",
-        "tcp://eth0:5600",
-        "tcp://127.0.0.1",
-        "tcp://127.0.0.1:99999",
-        "tcp://127.0.0.1:5600;tcp://0.0.0.0:1",
-        "tcp://localhost.example.org:5600",
-        "tcp://[::ffff:10.0.0.1]:5600",
-        "udp://127.0.0.1:5600",
-        "inproc://x",
-        "ipc://",
-        "ipc://" + "x" * 108,
-        "",
-    ],
-)
-def test_other_addresses_are_refused(endpoint: str) -> None:
-    with pytest.raises(ConfigError, match=r"stream\.endpoints") as caught:
-        publisher(StreamSettings((endpoint,)))
-    assert caught.value.exit_code == ExitCode.BAD_CONFIG
-
-
-@pytest.mark.parametrize("transport", ["tcp", "ipc", "abstract"])
-def test_an_address_in_use_is_refused_and_stays_with_its_owner(transport: str, tmp_path: Path) -> None:
-    named = {"tcp": LOCAL.endpoints[0], "ipc": f"ipc://{tmp_path}/pub", "abstract": f"ipc://@rfc-{os.getpid()}"}
-    with publisher(StreamSettings((named[transport],))) as owner:
-        taken = owner.endpoints[0] if transport == "tcp" else named[transport]
-        with pytest.raises(ConfigError, match="stop the other publisher"):
-            publisher(StreamSettings((taken,)))
-        with subscribed(owner, "pose") as client:
-            owner.pose(pose())
-            assert poses(client, 1) == [0]
-
-
-def test_a_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="folder"):
-        publisher(StreamSettings((f"ipc://{tmp_path}/none/pub",)))
-
-
-@pytest.mark.parametrize("values", [{"endpoints": ()}, {"send_high_water_mark": 0}, {"shape_encoding": "f8"}])
-def test_settings_are_checked(values: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(values))):
-        replace(LOCAL, **values)  # type: ignore[arg-type]
-
-
-def test_hashes_and_source_are_checked() -> None:
-    with pytest.raises(ConfigError, match="config_hash"):
-        Publisher(LOCAL, b"short", b"calibration", "sim")
-    with pytest.raises(ConfigError, match="source"):
-        Publisher(LOCAL, bytes(8), bytes(8), "dream")  # type: ignore[arg-type]
 
 
 def test_small_encodings_travel() -> None:
