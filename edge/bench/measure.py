@@ -6,7 +6,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,20 +23,22 @@ class Timing:
     """Of one call.
 
     Args:
-        median_ms, p99_ms: over all repetitions.
+        median_ms, p99_ms: CPU time of the calling thread over all repetitions: other processes do not count.
         after_others_ms: median of the first repetitions of a burst, when other calls have just used the caches.
+        wall_ms, wall_p99_ms: the same by the wall clock.
         repetitions: how many.
     """
 
     median_ms: float
     p99_ms: float
     after_others_ms: float
+    wall_ms: float
+    wall_p99_ms: float
     repetitions: int
 
-    @property
-    def spread(self) -> float:
-        """p99 over median."""
-        return self.p99_ms / self.median_ms if self.median_ms > 0 else float("inf")
+    def by_wall(self) -> Timing:
+        """For calls that use more than their own thread."""
+        return replace(self, median_ms=self.wall_ms, p99_ms=self.wall_p99_ms, after_others_ms=self.wall_ms)
 
 
 def measure(calls: Mapping[str, Callable[[], object]], budget_s: float) -> dict[str, Timing]:
@@ -48,39 +50,40 @@ def measure(calls: Mapping[str, Callable[[], object]], budget_s: float) -> dict[
     """
     for call in calls.values():
         call()
-    spent: dict[str, list[int]] = {name: [] for name in calls}
-    first: dict[str, list[int]] = {name: [] for name in calls}
+    bursts: dict[str, list[list[tuple[int, int]]]] = {name: [] for name in calls}
     used = dict.fromkeys(calls, 0)
     was_enabled = gc.isenabled()
     gc.disable()
     try:
         end_ns = time.perf_counter_ns() + round(budget_s * 1e9)
-        while time.perf_counter_ns() < end_ns or min(map(len, spent.values())) < FEWEST:
+        while time.perf_counter_ns() < end_ns or min(map(len, bursts.values())) < FEWEST:
             name = min(used, key=used.__getitem__)
             burst = _burst(calls[name])
-            spent[name] += burst
-            first[name].append(burst[0])
-            used[name] += sum(burst)
+            bursts[name].append(burst)
+            used[name] += sum(wall_ns for _, wall_ns in burst)
     finally:
         if was_enabled:
             gc.enable()
-    return {name: _timing(spent[name], first[name]) for name in calls}
+    return {name: _timing(bursts[name]) for name in calls}
 
 
-def _burst(call: Callable[[], object]) -> list[int]:
-    """Nanoseconds of up to ``BURST`` repetitions."""
-    taken: list[int] = []
+def _burst(call: Callable[[], object]) -> list[tuple[int, int]]:
+    """Nanoseconds of CPU and by the wall of up to ``BURST`` repetitions."""
+    taken: list[tuple[int, int]] = []
     while len(taken) < BURST:
-        start_ns = time.perf_counter_ns()
+        start_ns, start_cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         call()
-        taken.append(max(time.perf_counter_ns() - start_ns, 1))
-        if taken[-1] > SLOW_NS:
+        cpu_ns, wall_ns = time.thread_time_ns() - start_cpu_ns, time.perf_counter_ns() - start_ns
+        taken.append((max(cpu_ns, 1), max(wall_ns, 1)))
+        if wall_ns > SLOW_NS:
             break
     return taken
 
 
-def _timing(taken_ns: list[int], first_ns: list[int]) -> Timing:
-    ms = np.asarray(taken_ns) / 1e6
+def _timing(bursts: list[list[tuple[int, int]]]) -> Timing:
+    ms = np.array([one for burst in bursts for one in burst]) / 1e6
+    (cpu_ms, wall_ms), (cpu_p99_ms, wall_p99_ms) = np.median(ms, axis=0), np.percentile(ms, 99, axis=0)
+    first_ms = np.median([burst[0][0] for burst in bursts]) / 1e6
     return Timing(
-        float(np.median(ms)), float(np.percentile(ms, 99)), float(np.median(np.asarray(first_ns)) / 1e6), len(ms)
+        float(cpu_ms), float(cpu_p99_ms), float(first_ms), float(wall_ms), float(wall_p99_ms), repetitions=len(ms)
     )

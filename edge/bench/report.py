@@ -79,14 +79,20 @@ def _frames(frames: list[Result]) -> Iterator[str]:
             _ms(f["p99_ms"]),
             f"{f['p99_ms'] / f['median_ms']:.2f}",
             _ms(f["after_others_ms"]),
+            _ms(f["wall_ms"]),
             f"{f['found']} of {f['points']}",
         ]
         for f in frames
     ]
     yield from table(
-        ["case", "median ms", "goal ms", "p99 ms", "p99/median", "after others ms", "found of points"], rows
+        ["case", "median ms", "goal ms", "p99 ms", "p99/median", "after others ms", "wall ms", "found of points"],
+        rows,
     )
-    yield "*After others*: first repetitions of the bursts, when another call has just filled the caches."
+    yield (
+        "Times are CPU time of the thread, so that other processes of a shared machine do not count; those of two "
+        "cores are by the wall clock. *After others*: first repetitions of the bursts, when another call has just "
+        "filled the caches. *Wall*: median by the wall clock."
+    )
     yield ""
 
 

@@ -49,7 +49,7 @@ def run_suite(rig: Rig, seconds: float, cold: bool) -> dict[str, Any]:
         "machine": machine(rig),
         "frames": [_as_dict(case, frame_times) for case in frames],
         "stages": [_as_dict(case, part_times) for case in parts],
-        "hand_off_us": 1e3 * hand_off.median_ms,
+        "hand_off_us": 1e3 * hand_off.wall_ms,
         "ceilings": asdict(top),
         "work": _work(rig, medians, top),
         "starts": [
@@ -90,7 +90,8 @@ def _key(case: Case, peer: Contender | None = None) -> str:
 def _measured(cases: list[Case], seconds: float) -> dict[str, Timing]:
     calls = {_key(case): case.call for case in cases}
     calls |= {_key(case, peer): peer.call for case in cases for peer in case.peers}
-    return measure(calls, seconds)
+    times = measure(calls, seconds)
+    return times | {_key(case): times[_key(case)].by_wall() for case in cases if case.cores > 1}
 
 
 def _as_dict(case: Case, times: dict[str, Timing]) -> dict[str, Any]:
