@@ -165,7 +165,7 @@ class AssociationSettings:
     rule: AssociationRule = "optimal"
     range_gate_bins: float = 0.5
     level_scale_db: float = 3.0
-    doppler_sigma_m_s: float = 0.3
+    doppler_sigma_m_s: float = 0.2
     max_discrepancy_db: float = 3.0
     sidelobe_db: float = 25.0
     fov_deg: float = 45.0

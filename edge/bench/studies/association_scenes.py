@@ -180,6 +180,7 @@ class Raw:
         targets, depth_m: as in Level.
         power_db: of a mean reflector at 1 m, dB over 1 LSB^2.
         phase_deg: standard deviation of the channels' phases that calibration left.
+        speed_m_s: the rig drives sideways.
     """
 
     name: str
@@ -187,6 +188,7 @@ class Raw:
     depth_m: float
     power_db: float
     phase_deg: float
+    speed_m_s: float = 0.0
 
 
 RAWS = (
@@ -196,6 +198,11 @@ RAWS = (
     Raw("30 strong within 3 m", 30, 3.0, 75.0, 3.0),
     Raw("10 strong, perfect calibration", 10, 8.0, 75.0, 0.0),
 )
+MOVING = (
+    Raw("30 within 3 m, 1 m/s", 30, 3.0, 70.0, 3.0, 1.0),
+    Raw("30 within 3 m, 5 m/s", 30, 3.0, 70.0, 3.0, 5.0),
+    Raw("30 within 8 m, 5 m/s", 30, 8.0, 70.0, 3.0, 5.0),
+)
 
 
 def raw_scenes(rng: np.random.Generator, raw: Raw, rig: Rig, count: int) -> Iterator[Scene]:
@@ -204,19 +211,23 @@ def raw_scenes(rng: np.random.Generator, raw: Raw, rig: Rig, count: int) -> Iter
     detectors = {r: Detector(rig.radars[r], rig.settings.cfar) for r in RADARS}
     for number in range(count):
         truth_m = _reflectors(rng, raw.targets, raw.depth_m, rig.geometry.height_m)
-        direction = truth_m / np.linalg.norm(truth_m, axis=1, keepdims=True)
         strength_db = raw.power_db + rng.normal(0.0, SPREAD_DB, raw.targets)
-        found = []
+        velocity, found = np.array([0.0, raw.speed_m_s, 0.0]), []
         for radar in RADARS:
             board = rig.radars[radar]
+            delay_s = 0.5 * board.schedule.frame_period_s * (radar == "vertical")
+            points_m = truth_m - velocity * delay_s
+            direction = points_m / np.linalg.norm(points_m, axis=1, keepdims=True)
             faded = 10.0 ** ((strength_db + rng.normal(0.0, 3.0, raw.targets)) / 20.0)
-            faded = faded * np.exp(2j * np.pi * rng.random(raw.targets)) / np.sum(truth_m**2, axis=1)
+            faded = faded * np.exp(2j * np.pi * rng.random(raw.targets)) / np.sum(points_m**2, axis=1)
             amplitude = faded * antenna_amplitude(radar, direction, rig.settings.antenna)
             channels = (board.schedule.layout.slots, board.schedule.layout.devices * board.schedule.layout.rx)
-            gain = np.exp(1j * np.radians(raw.phase_deg) * rng.standard_normal(channels))
-            frame = make_frame(board, truth_m, amplitude, number, 0, noise_lsb=25.0, rng=rng, channel_gain=gain)
-            found.append(detectors[radar].process(imagers[radar].process(frame, np.zeros(3))))
-        yield Scene(found[0], found[1], np.zeros(3), truth_m, np.ones(raw.targets, dtype=np.bool_))
+            frame = make_frame(
+                *(board, points_m, amplitude, number, round(delay_s * 1e9), velocity, 25.0, rng),
+                channel_gain=np.exp(1j * np.radians(raw.phase_deg) * rng.standard_normal(channels)),
+            )
+            found.append(detectors[radar].process(imagers[radar].process(frame, velocity)))
+        yield Scene(found[0], found[1], velocity, truth_m, np.ones(raw.targets, dtype=np.bool_))
 
 
 @dataclass(frozen=True, slots=True)
