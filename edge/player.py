@@ -24,17 +24,18 @@ class Pace:
     Args:
         speed: recorded seconds per second; 0 plays as fast as it goes.
         idle: called again and again while it waits.
+        stopped: True ends the wait.
     """
 
-    def __init__(self, speed: float, idle: Callable[[], None] | None = None) -> None:
-        self._speed, self._idle = speed, idle
+    def __init__(
+        self, speed: float, idle: Callable[[], None] | None = None, stopped: Callable[[], bool] | None = None
+    ) -> None:
+        self._speed, self._idle, self._stopped = speed, idle, stopped
         self._start: tuple[int, int] | None = None
         self._last_ns = 0
-        self.late_ns = 0
-        """How long ago the last item was due."""
 
     def wait(self, t_ns: int) -> None:
-        """Sleep until recorded instant ``t_ns`` is due."""
+        """Sleep until recorded instant ``t_ns`` is due, or until ``stopped``."""
         if self._speed <= 0:
             return
         now_ns = time.monotonic_ns()
@@ -42,11 +43,12 @@ class Pace:
             self._start = (t_ns, now_ns)
         self._last_ns = t_ns
         due_ns = self._start[1] + round((t_ns - self._start[0]) / self._speed)
-        self.late_ns = max(0, now_ns - due_ns)
         while (ahead_ns := due_ns - time.monotonic_ns()) > 0:
             time.sleep(min(ahead_ns / 1e9, LONGEST_NAP_S))
             if self._idle is not None:
                 self._idle()
+            if self._stopped is not None and self._stopped():
+                return
 
 
 def play(
@@ -56,8 +58,9 @@ def play(
     total: int | None = None,
     show_progress: bool = True,
     idle: Callable[[], None] | None = None,
+    stopped: Callable[[], bool] | None = None,
 ) -> None:
-    """Feed everything a source has, then finish the pipeline.
+    """Feed everything a source has, or what it has until ``stopped``, then finish the pipeline.
 
     Args:
         source: frames, poses and losses in time order.
@@ -66,12 +69,15 @@ def play(
         total: radar frames and losses the source will give, when it knows.
         show_progress: draw a bar when stderr is a terminal.
         idle: called again and again while the next item is not due.
+        stopped: asked before every item; True leaves the rest of the source.
     """
-    pace = Pace(speed, idle)
+    pace = Pace(speed, idle, stopped)
     with _progress(total, show_progress) as bar:
         for item in source:
             if not isinstance(item, Loss):
                 pace.wait(item.t_ns if isinstance(item, Pose) else item.t_first_chirp_ns)
+            if stopped is not None and stopped():
+                break
             pipeline.feed(item)
             if not isinstance(item, Pose):
                 bar.update(item.count if isinstance(item, Loss) else 1)

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import resource
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from edge.errors import WireError
 from edge.pipeline import FrameResult, Pipeline, WindowResult
@@ -58,6 +60,23 @@ class PublishingSink:
         while time.monotonic() < end_s:
             self.report("INIT")
             time.sleep(0.02)
+
+    @contextmanager
+    def starting(self) -> Iterator[None]:
+        """Give signs of life of state INIT from a thread of its own, while this one compiles or loads."""
+        done = threading.Event()
+
+        def live() -> None:
+            while not done.wait(0.02):
+                self.report("INIT")
+
+        thread = threading.Thread(target=live, name="starting", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
 
     def report(self, state: State = "RUN") -> None:
         """Heartbeat and status, as far as they are due."""

@@ -39,9 +39,9 @@ def run(args: argparse.Namespace) -> int:
         *(rig, args, "sim", f"simulated drive-by of {thing.credit}", ["simulated radar data"]), thing.truth_odom_m()
     )
     with RecordingReader(path) as reader:
-        pictures = run.run(reader, reader.total_frames)
-    run.report(pictures, _closing(run, thing, time.monotonic() - start_s))
-    return ExitCode.OK if run.tally.shapes else ExitCode.DEGRADED
+        run.run(reader, reader.total_frames)
+    run.report(_closing(run, thing, time.monotonic() - start_s))
+    return run.exit_code(ExitCode.OK if run.tally.shapes else ExitCode.DEGRADED)
 
 
 def _closing(run: session.Session, thing: DemoObject, elapsed_s: float) -> dict[str, Any]:

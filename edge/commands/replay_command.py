@@ -23,7 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Open, play, report; exit code 3 when frames were lost or the recording is cut or damaged."""
+    """Open, play, report; exit code 3 when frames were lost or the recording is cut or damaged.
+
+    Ctrl-C and SIGTERM end the run in order: account printed, exit code 130 or 143.
+    """
     path: Path = args.recording
     if path.is_dir():
         rig = rig_of(args)
@@ -41,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _play(run: session.Session, source: FrameSource) -> int:
-    pictures = run.run(source, source.total_frames)
+    run.run(source, source.total_frames)
     damaged = isinstance(source, RecordingReader) and (source.truncated or source.report.bytes_lost > 0)
     if isinstance(source, RecordingReader) and source.report.damaged_chunks:
         run.notes.append(f"{source.path}: damaged chunks left out: {source.report.damaged_chunks}")
@@ -49,6 +52,6 @@ def _play(run: session.Session, source: FrameSource) -> int:
     nothing = not any(account.frames_in for account in accounts)
     if nothing:
         run.notes.append("there was not a single radar frame")
-    run.report(pictures)
+    run.report()
     lost = any(account.frames_lost for account in accounts)
-    return ExitCode.DEGRADED if lost or damaged or nothing else ExitCode.OK
+    return run.exit_code(ExitCode.DEGRADED if lost or damaged or nothing else ExitCode.OK)

@@ -83,7 +83,7 @@ def as_dict(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: S
     }
 
 
-def lines(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: Sequence[str]) -> list[str]:
+def lines(pipeline: Pipeline, tally: Tally, notes: Sequence[str]) -> list[str]:
     """The whole report for people."""
     text = [f"{'radar':<12}{'frames in':>10}{'ok':>8}{'lost':>8}  causes"]
     for radar, ledger in pipeline.ledgers.items():
@@ -100,7 +100,6 @@ def lines(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: Seq
     if pipeline.faults.last:
         text.append(f"last fault: {pipeline.faults.last}")
     text += [f"note: {note}" for note in notes]
-    text += [f"picture: {path}" for path in pictures]
     return text
 
 

@@ -7,15 +7,17 @@ import argparse
 import json
 import time
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from edge.commands import arguments
+from edge.commands.interrupts import Interrupts
 from edge.commands.report import Narrator, Tally, as_dict, lines
 from edge.completion.manifest import find_model
 from edge.completion.model import CompletionModel
+from edge.errors import ExitCode
 from edge.frames import RADARS, Float32, Pose, RadarFrame
 from edge.pipeline import Pipeline, Sink
 from edge.player import play
@@ -75,13 +77,14 @@ class Session:
         truth_odom_m: Float32 | None = None,
     ) -> None:
         self.rig, self.tally, self.notes = rig, Tally(), list(notes)
-        self._args, self._stack = args, ExitStack()
+        self._args, self._stack, self._interrupts = args, ExitStack(), Interrupts()
+        self._undrawn = False
         model, more = load_model(rig)
         self.notes += more
         sinks: list[Sink] = [self.tally] if args.json else [self.tally, Narrator()]
         self._pictures: PictureCollector | None = None
         if args.plot is not None:
-            self._pictures = PictureCollector(args.plot, title, truth_odom_m)
+            self._pictures = PictureCollector(args.plot, title, truth_odom_m, rig.settings.association.fov_deg)
             sinks.append(self._pictures)
         self.pipeline = Pipeline(rig, model, sinks)
         self._publishing: PublishingSink | None = None
@@ -103,28 +106,65 @@ class Session:
         if not self._args.json:
             print(text, flush=True)
 
-    def run(self, source: Iterable[RadarFrame | Pose | Loss], total: int | None) -> list[Path]:
-        """Play the source to its end; returns the pictures that were written."""
-        publishing = self._publishing
-        idle = publishing.report if publishing is not None else None
-        with self._stack:
-            start_s = time.monotonic()
-            warm_up(self.rig, self.pipeline)
-            self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
-            if publishing is not None:
-                publishing.invite(JOIN_S)
-            play(source, self.pipeline, self._args.speed, total, not self._args.json, idle)
-            if publishing is not None:
-                publishing.report("STOP")
-        return self._pictures.write() if self._pictures is not None else []
+    def run(self, source: Iterable[RadarFrame | Pose | Loss], total: int | None) -> None:
+        """Play the source to its end, or until Ctrl-C or SIGTERM; either way the publisher says STOP.
 
-    def report(self, pictures: Sequence[Path], extra: dict[str, Any] | None = None) -> None:
-        """Print the account on stdout."""
+        The addresses are bound before the kernels are ready: until then heartbeats say INIT.
+        """
+        publishing, asked = self._publishing, self._interrupts.asked
+        idle = publishing.report if publishing is not None else None
+        with self._stack, self._interrupts:
+            try:
+                self._warm_up()
+                if publishing is not None and not asked():
+                    publishing.invite(JOIN_S)
+                play(source, self.pipeline, self._args.speed, total, not self._args.json, idle, asked)
+            finally:
+                if publishing is not None:
+                    publishing.report("STOP")
+        if self._interrupts.received is not None:
+            self.notes.append(f"ended by {self._interrupts.received.name}: the rest was not played")
+
+    def _warm_up(self) -> None:
+        start_s = time.monotonic()
+        with self._publishing.starting() if self._publishing is not None else nullcontext():
+            warm_up(self.rig, self.pipeline)
+        self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+
+    def report(self, extra: dict[str, Any] | None = None) -> None:
+        """Print the account on stdout, then draw: a picture that fails costs no figures."""
         if self._args.json:
+            pictures = self._draw()
             content = {**as_dict(self.pipeline, self.tally, pictures, self.notes), **(extra or {})}
             print(json.dumps(content, indent=2))
             return
-        print("\n".join(lines(self.pipeline, self.tally, pictures, self.notes)))
+        print("\n".join(lines(self.pipeline, self.tally, self.notes)))
         for key, value in (extra or {}).items():
             name, _, unit = key.rpartition("_")
-            print(f"{name.replace('_', ' ')}: {value} {unit}" if unit in ("s", "cm") else f"{key}: {value}")
+            print(f"{name.replace('_', ' ')}: {value} {unit}" if unit in ("s", "cm") else f"{key}: {value}", flush=True)
+        told = len(self.notes)
+        for path in self._draw():
+            print(f"picture: {path}")
+        for note in self.notes[told:]:
+            print(f"note: {note}")
+
+    def exit_code(self, code: ExitCode) -> int:
+        """That of the signal after an interrupted run; 3 instead of 0 when pictures could not be drawn."""
+        if self._interrupts.asked():
+            return self._interrupts.exit_code
+        return ExitCode.DEGRADED if self._undrawn and code == ExitCode.OK else code
+
+    def _draw(self) -> list[Path]:
+        """Pictures that were written; whatever the drawing library refuses becomes a note."""
+        if self._pictures is None:
+            return []
+        if self._interrupts.asked():
+            self.notes.append("no pictures of an interrupted run")
+            return []
+        paths: list[Path] = []
+        try:
+            paths.extend(self._pictures.write())
+        except Exception as error:  # matplotlib, its fonts and the disk have no common root
+            self._undrawn = True
+            self.notes.append(f"pictures could not be drawn ({type(error).__name__}: {error})")
+        return paths

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.best_shapes import keep_best
+from edge.config import AssociationSettings
 from edge.frames import RADARS, Detections, Float32, FusedCloud, Heatmap, Pose, RadarId, Shape
 from edge.odometry.transforms import rotation_matrix
 from edge.pipeline import FrameResult, WindowResult
@@ -17,7 +18,7 @@ from edge.plot.heatmaps import heatmap_picture
 from edge.plot.shapes import shape_picture
 
 MAX_KEPT_FRAMES = 4096
-FOV_COSINE = float(np.sin(np.radians(45.0)))
+FOV_DEG = AssociationSettings().fov_deg
 
 
 class PictureCollector:
@@ -27,14 +28,17 @@ class PictureCollector:
         folder: where ``write`` puts the PNGs.
         subtitle: one line under every title, such as the recording's name.
         truth_odom_m: float32 [n, 3], surface of the true object in the odometry frame, for simulated scenes.
+        fov_deg: field of view of the association (``association.fov_deg``).
     Raises:
         DependencyError: matplotlib is not installed.
         RfconstructError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, subtitle: str, truth_odom_m: Float32 | None = None) -> None:
+    def __init__(
+        self, folder: Path, subtitle: str, truth_odom_m: Float32 | None = None, fov_deg: float = FOV_DEG
+    ) -> None:
         prepare_folder(folder)
-        self.folder, self.subtitle, self._truth_odom_m = folder, subtitle, truth_odom_m
+        self.folder, self.subtitle, self._truth_odom_m, self._fov_deg = folder, subtitle, truth_odom_m, fov_deg
         self._best: tuple[int, dict[RadarId, Heatmap], dict[RadarId, Detections]] | None = None
         self._frames: list[tuple[Pose, dict[RadarId, Detections]]] = []
         self._window: tuple[FusedCloud, list[tuple[Pose, dict[RadarId, Detections]]]] | None = None
@@ -62,10 +66,10 @@ class PictureCollector:
         """Write all pictures that there is something for; returns their paths."""
         paths = []
         if self._best is not None:
-            paths.append(heatmap_picture(self.folder / "heatmaps.png", *self._best[1:], self.subtitle))
+            paths.append(heatmap_picture(self.folder / "heatmaps.png", *self._best[1:], self.subtitle, self._fov_deg))
         if self._window is not None and len(self._window[0]):
             cloud, frames = self._window
-            alone = [single_radar_points(radar, frames, cloud.reference) for radar in RADARS]
+            alone = [single_radar_points(radar, frames, cloud.reference, self._fov_deg) for radar in RADARS]
             span = f"{self.subtitle}; {cloud.frames} frames, {cloud.travel_m:.2f} m of travel"
             paths.append(cloud_picture(self.folder / "fused_cloud.png", cloud, alone[0], alone[1], span))
         for identity, shape in sorted(self._shapes.items()):
@@ -76,7 +80,10 @@ class PictureCollector:
 
 
 def single_radar_points(
-    radar: RadarId, frames: list[tuple[Pose, dict[RadarId, Detections]]], reference: Pose
+    radar: RadarId,
+    frames: list[tuple[Pose, dict[RadarId, Detections]]],
+    reference: Pose,
+    fov_deg: float = FOV_DEG,
 ) -> Float32:
     """One radar's detections inside its field of view, placed by the poses; the unknown direction is set to zero.
 
@@ -84,6 +91,7 @@ def single_radar_points(
         radar: which.
         frames: pose of the rig and detections of every frame.
         reference: pose of the frame of reference of the result.
+        fov_deg: largest angle off boresight along the radar's array.
     Returns:
         float32 [n, 4]: x, y, z in metres in the frame of ``reference``, power in dB.
     """
@@ -92,7 +100,7 @@ def single_radar_points(
     parts = [np.zeros((0, 4))]
     for pose, detections in frames:
         found = detections[radar]
-        inside = np.abs(found.direction_cosine) <= FOV_COSINE
+        inside = np.abs(found.direction_cosine) <= np.sin(np.radians(fov_deg))
         r, u = found.range_m[inside].astype(np.float64), found.direction_cosine[inside].astype(np.float64)
         rig_m = np.zeros((len(r), 3))
         rig_m[:, 0], rig_m[:, along] = r * np.sqrt(1.0 - u**2), r * u

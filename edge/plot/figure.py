@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str = ""
     Args:
         width_in, height_in: size in inches.
         title: what it shows.
-        subtitle: one muted line below it.
+        subtitle: one muted line below it; both are drawn as they are, whatever characters a file name has.
     Raises:
         DependencyError: matplotlib is not installed.
     """
@@ -32,9 +33,20 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str = ""
 
     below_head = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, 1.0 - HEAD_IN / height_in))
     figure = Figure(figsize=(width_in, height_in), layout=below_head, facecolor="white")
-    figure.text(0.01, 1.0 - 0.24 / height_in, title, ha="left", va="center", fontsize=13, color=INK, fontweight="bold")
-    figure.text(0.01, 1.0 - 0.48 / height_in, subtitle, ha="left", va="center", fontsize=9, color=MUTED)
+    looks: tuple[dict[str, Any], ...] = (
+        {"fontsize": 13, "color": INK, "fontweight": "bold"},
+        {"fontsize": 9, "color": MUTED},
+    )
+    for text, below_in, look in zip((title, subtitle), (0.24, 0.48), looks, strict=True):
+        y = 1.0 - below_in / height_in
+        figure.text(0.01, y, drawable(text), ha="left", va="center", parse_math=False, **look)
     return figure
+
+
+def drawable(text: str) -> str:
+    """One line that can be drawn: bytes of a file name that are no UTF-8 as escapes, control characters as "?"."""
+    escaped = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return "".join(letter if letter.isprintable() else "?" for letter in escaped)
 
 
 def require_matplotlib() -> None:
@@ -77,10 +89,12 @@ def dress(axes: Any, title: str, x_label: str, y_label: str) -> None:
 
 
 def write(figure: Any, path: Path) -> Path:
-    """Write a PNG.
+    """Write a PNG; a letter that the font lacks is an empty box.
 
     Returns:
         ``path``.
     """
-    figure.savefig(path, dpi=DPI)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        figure.savefig(path, dpi=DPI)
     return path

@@ -14,10 +14,9 @@ from edge.plot.figure import INK, MUTED, dress, new_figure, write
 
 DYNAMIC_RANGE_DB = 50.0
 SHOWN_COSINE = np.sin(np.radians(70.0))
-FIELD_OF_VIEW_COSINE = np.sin(np.radians(45.0))
 NEAREST_LIMIT_M, FARTHEST_LIMIT_M = 5.0, 15.0
-VERTICAL_SHARE = 0.75
-"""Heights up to this share of the range are drawn: somewhat more than the field of view."""
+VERTICAL_MARGIN = 1.06
+"""Heights are drawn up to somewhat more than the field of view."""
 
 
 def heatmap_picture(
@@ -25,6 +24,7 @@ def heatmap_picture(
     heatmaps: Mapping[RadarId, Heatmap],
     detections: Mapping[RadarId, Detections],
     subtitle: str,
+    fov_deg: float,
 ) -> Path:
     """Write the heatmaps of one frame: the horizontal radar from above, the vertical one from the side.
 
@@ -32,13 +32,14 @@ def heatmap_picture(
         path: of the PNG.
         heatmaps, detections: radar id -> data of the same frame.
         subtitle: what was recorded, in one line.
+        fov_deg: field of view of the association along each array, drawn as two rays.
     """
     number = next(iter(heatmaps.values())).number
     limit_m = _limit_m(detections)
     size_in = (7.4, 5.8) if len(heatmaps) == 1 else (12.6, 6.6)
     figure = new_figure(*size_in, f"Range-angle heatmaps and CFAR detections, frame {number}", subtitle)
     for axes, (radar, heatmap) in zip(_row(figure, len(heatmaps)), heatmaps.items(), strict=True):
-        _panel(figure, axes, heatmap, detections[radar], limit_m)
+        _panel(figure, axes, heatmap, detections[radar], limit_m, np.radians(fov_deg))
     return write(figure, path)
 
 
@@ -54,15 +55,15 @@ def _row(figure: Any, count: int) -> list[Any]:
     return list(np.atleast_1d(figure.subplots(1, count, width_ratios=ratios)).ravel())
 
 
-def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m: float) -> None:
+def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m: float, fov_rad: float) -> None:
     from_above = heatmap.radar == "horizontal"
     power_db, along_m, forward_m = _cartesian(heatmap, limit_m)
     top_db = float(power_db[:, heatmap.range_m[: power_db.shape[1]] > 1.0].max())
     shown = (found.range_m <= limit_m) & (np.abs(found.direction_cosine) <= SHOWN_COSINE)
     r, u = found.range_m[shown], found.direction_cosine[shown]
-    edge_m = limit_m * FIELD_OF_VIEW_COSINE
+    edge_m, ahead_m = limit_m * float(np.sin(fov_rad)), limit_m * float(np.cos(fov_rad))
     corners, spots = (along_m, forward_m), (r * u, r * np.sqrt(1 - u**2))
-    rays = [((0.0, side * edge_m), (0.0, edge_m)) for side in (-1.0, 1.0)]
+    rays = [((0.0, side * edge_m), (0.0, ahead_m)) for side in (-1.0, 1.0)]
     if not from_above:
         corners, spots, rays = corners[::-1], spots[::-1], [ray[::-1] for ray in rays]
     mesh = axes.pcolormesh(
@@ -84,7 +85,7 @@ def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m:
     if from_above:
         axes.invert_xaxis()
     else:
-        axes.set_ylim(-VERTICAL_SHARE * limit_m, VERTICAL_SHARE * limit_m)
+        axes.set_ylim(-VERTICAL_MARGIN * edge_m, VERTICAL_MARGIN * edge_m)
     bar = figure.colorbar(mesh, ax=axes, shrink=0.7, pad=0.02, location="bottom")
     bar.set_label("power (dB over 1 LSB²)", fontsize=9, color=MUTED)
     bar.ax.tick_params(labelsize=8, colors=INK)

@@ -41,6 +41,6 @@ def test_an_unknown_object_says_what_it_is_most_likely(
 ) -> None:
     tally = Tally()
     tally.shapes[3] = shape(class_name, probability)
-    (line,) = [line for line in lines(Pipeline(RIG, None), tally, [], []) if line.startswith("object")]
+    (line,) = [line for line in lines(Pipeline(RIG, None), tally, []) if line.startswith("object")]
     assert line.startswith(told)
     assert line.endswith("from 2048 radar points of 60 frames")

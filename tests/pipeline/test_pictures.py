@@ -15,6 +15,7 @@ from edge.best_shapes import MAX_SHAPES, keep_best
 from edge.frames import Detections, Float32, FusedCloud, ObjectCloud, Pose, RadarId, Shape
 from edge.pipeline import FrameResult, Pipeline, WindowResult
 from edge.plot.collector import PictureCollector, single_radar_points, to_object_frame
+from edge.plot.figure import drawable, new_figure, write
 
 FRAMES = 3
 
@@ -144,6 +145,38 @@ def test_single_radar_points_stand_still_while_the_rig_drives(kept: Keep) -> Non
     points = single_radar_points("horizontal", frames, here)  # type: ignore[arg-type]
     np.testing.assert_allclose(points[:, :3], np.tile([ahead_m[1], -moved_m, 0.0], (2, 1)), atol=1e-5)
     assert single_radar_points("vertical", frames, here).shape == (0, 4)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("fov_deg", "count"), [(45.0, 2), (20.0, 1)])
+def test_the_field_of_view_is_the_rigs(fov_deg: float, count: int) -> None:
+    u = np.sin(np.radians(np.array([0.0, -30.0, 60.0]))).astype(np.float32)
+    found = Detections("vertical", 0, T0_NS, np.ones_like(u), u, *[np.zeros_like(u)] * 3)
+    here = pose_at(T0_NS)
+    points = single_radar_points("vertical", [(here, {"vertical": found})], here, fov_deg)
+    np.testing.assert_allclose(points[:, 2], u[:count], atol=1e-6)
+
+
+@pytest.mark.parametrize("fov_deg", [10.0, 80.0])
+def test_heatmaps_with_another_field_of_view(kept: Keep, tmp_path: Path, fov_deg: float) -> None:
+    collector = PictureCollector(tmp_path, "scene", fov_deg=fov_deg)
+    collector.frame(kept.frames[0])
+    assert size(collector.write()[0])[0] > 1000
+
+
+@pytest.mark.parametrize(
+    ("name", "drawn"),
+    [
+        ("caf\udce9.mcap", "caf\\udce9.mcap"),
+        ("a\tb\nc\x1b[31m", "a?b?c?[31m"),
+        ("$x_{1$ \\frac", "$x_{1$ \\frac"),
+        ("漢字 é", "漢字 é"),
+    ],
+)
+def test_any_file_name_is_a_line_of_a_picture(kept: Keep, tmp_path: Path, name: str, drawn: str) -> None:
+    assert drawable(name) == drawn
+    figure = new_figure(5.0, 3.0, name, name)
+    assert [text.get_text() for text in figure.texts] == [drawn] * 2
+    assert size(write(figure, tmp_path / "a.png"))[0] == 650
 
 
 def test_the_truth_in_the_object_frame() -> None:

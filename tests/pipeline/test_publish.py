@@ -153,6 +153,21 @@ def test_what_the_wire_cannot_carry_is_counted_and_the_rest_goes_on(
     assert pipeline.faults.last == "too far for this encoding"
 
 
+def test_heartbeats_say_init_while_kernels_compile(publisher: Publisher) -> None:
+    sink = PublishingSink(publisher, "1")
+    sink.watch(Pipeline(RIG, None))
+    with joined(publisher) as client:
+        with sink.starting():
+            beats: list[HeartbeatMessage] = []
+            while len(beats) < 3:
+                message = client.recv(10.0)
+                assert message is not None
+                if isinstance(message, HeartbeatMessage):
+                    beats.append(message)
+        assert {beat.state for beat in beats} == {"INIT"}
+    assert not [thread for thread in threading.enumerate() if thread.name == "starting"]
+
+
 def test_percentiles_are_not_computed_for_every_frame(publisher: Publisher, monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline, sink = Pipeline(RIG, None), PublishingSink(publisher, "1")
     sink.watch(pipeline)
