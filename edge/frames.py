@@ -192,6 +192,20 @@ class DopplerMaps:
 
 
 @dataclass(frozen=True, slots=True)
+class BurstMotion:
+    """The rig's motion that a heatmap was steered with: what it shows is the scene at the middle of the burst.
+
+    Args:
+        delay_s: that instant after the first chirp.
+        forward_m_s, along_m_s: speeds of the rig along boresight and along the radar's array.
+    """
+
+    delay_s: float
+    forward_m_s: float
+    along_m_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Heatmap:
     """Range-angle power of one radar.
 
@@ -204,8 +218,7 @@ class Heatmap:
         range_m: float32 [range], from the phase centre of the array.
         response: how a point target appears; None: unknown, detections are interpolated by plain parabolas.
         doppler: maps whose largest value ``power`` holds; None: Doppler was not kept.
-        range_drift_m: float32 [angle], what the rig's motion up to the middle of the burst took off a static point's
-            range; None: nothing that counts.
+        motion: what was steered with; None: the scene is shown as at the first chirp.
     """
 
     radar: RadarId
@@ -216,7 +229,7 @@ class Heatmap:
     range_m: Float32
     response: PointResponse | None = None
     doppler: DopplerMaps | None = None
-    range_drift_m: Float32 | None = None
+    motion: BurstMotion | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,7 @@ class Detector:
         self._refine(heatmap, kept)
         columns = self._columns[:, :kept].copy()
         cells, ranges = self._cells[self._index[:kept]], heatmap.power.shape[1]
-        doppler = finish(heatmap, cells // ranges, cells % ranges, columns[0])
+        doppler = finish(heatmap, cells // ranges, cells % ranges, columns[0], columns[1])
         return Detections(
             *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, columns[0], columns[1], columns[2]),
             *(doppler, columns[3]),

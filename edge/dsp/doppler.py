@@ -14,6 +14,7 @@ from edge.dsp.row import RowChannels, RowGeometry
 from edge.frames import DopplerMaps, Float32, Heatmap
 
 ANGLE_LANES = 32
+LEAST_RANGE_M = 0.1
 
 
 class DopplerFft:
@@ -123,18 +124,29 @@ def speeds_m_s(maps: DopplerMaps, angle: NDArray[np.int64], range_bin: NDArray[n
     return np.asarray(speed, dtype=np.float32)
 
 
-def finish(heatmap: Heatmap, angle: NDArray[np.int64], range_bin: NDArray[np.int64], range_m: Float32) -> Float32:
-    """Doppler of detected cells, and their ranges moved back to the first chirp.
+def finish(
+    heatmap: Heatmap,
+    angle: NDArray[np.int64],
+    range_bin: NDArray[np.int64],
+    range_m: Float32,
+    direction_cosine: Float32,
+) -> Float32:
+    """Doppler of detected cells, and their places moved back from the middle of the burst to its first chirp.
+
+    A static point at (r, u) closes in by c = v_x sqrt(1 - u^2) + v_along u and turns by du/dt = (c u - v_along) / r.
 
     Args:
         heatmap: in which they were detected.
         angle, range_bin: int64 [n], their cells.
-        range_m: float32 [n], corrected in place for the motion up to the middle of the burst.
+        range_m, direction_cosine: float32 [n], corrected in place.
     Returns:
         float32 [n] radial speed, positive away; NaN where it was not measured.
     """
-    if heatmap.range_drift_m is not None:
-        range_m += heatmap.range_drift_m[angle]
+    if heatmap.motion is not None:
+        motion, u = heatmap.motion, direction_cosine
+        closing_m_s = motion.forward_m_s * np.sqrt(np.maximum(1.0 - u * u, 0.0)) + motion.along_m_s * u
+        u -= motion.delay_s * (closing_m_s * u - motion.along_m_s) / np.maximum(range_m, LEAST_RANGE_M)
+        range_m += motion.delay_s * closing_m_s
     if heatmap.doppler is None:
         return np.full(len(angle), np.nan, dtype=np.float32)
     speed_m_s = speeds_m_s(heatmap.doppler, angle, range_bin)

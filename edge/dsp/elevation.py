@@ -19,9 +19,9 @@ Complex128 = NDArray[np.complex128]
 class ElevationRows:
     """One beam per elevation row of a board, for single cells of the last frame.
 
-    A row at elevation h (in design half wavelengths d) sees a point at direction cosine w across the array with the
-    phase 2 pi h d w / lambda more than the filled row: the beams' phases tell w. The 7 elements of the cascade's
-    elevation aperture resolve 18 degrees, and w repeats by 1 / 0.51 = 1.95.
+    A row at elevation h (in design half wavelengths d) sees a point at direction cosine w across the array, towards the
+    side on which the row stands, with the phase 2 pi h d w / lambda less than the filled row: the beams' phases tell w.
+    The 7 elements of the cascade's elevation aperture resolve 18 degrees, and w repeats by 1 / 0.51 = 1.95.
 
     Args:
         radar: board and mounting.
@@ -47,7 +47,7 @@ class ElevationRows:
         elevation = array.tx_elevation[:, None] + array.rx_elevation
         slot = np.array([s for s, _ in blocks])
         receiver = np.array([d * rx for _, d in blocks])[:, None] + np.arange(rx)
-        sign = radar.mounting.array_sign * (1.0 if radar.radar == "horizontal" else -1.0)
+        nearer = radar.mounting.array_sign * (1.0 if radar.radar == "horizontal" else -1.0)
         self.elevation, self._which = np.unique(elevation[slot[:, None], receiver], return_inverse=True)
         """Elevations of the rows, design half wavelengths, ascending, as the board counts them."""
         self._which = self._which.reshape(receiver.shape)
@@ -55,7 +55,7 @@ class ElevationRows:
         self._phasor, self._along_m, self._time_s = phasor, along_m, time_s
         self._wavelength_m = wavelength_m
         self._count = np.bincount(self._which.ravel())
-        self.turns_per_cosine = sign * array.unit_m * self.elevation / wavelength_m
+        self.turns_per_cosine = -nearer * array.unit_m * self.elevation / wavelength_m
         """Phase of each row per direction cosine across the array along the other rig axis, in turns."""
 
     def beams(self, spectra: Float32, range_bin: int, direction_cosine: float, closing_m_s: float = 0.0) -> Complex64:

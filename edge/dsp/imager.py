@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 SHORTEST_RANGE_M = 0.05
 ANGLE_LANES = 32
-LARGEST_MOTION_ERROR_RAD = 0.03
+LARGEST_MOTION_ERROR_RAD = 0.01
 """Motion's phase error over the row, rms at the edge of the field of view, that is left alone."""
 
 
@@ -43,7 +43,7 @@ class Imager:
     Power is LSB^2 per complex sample: a point target of amplitude a LSB in the middle of a cell gives a^2, divided by
     the two-way antenna gain along the array. Elements of the virtual row that are missing are zeros; doubled ones are
     averaged. The rig's motion turns the chirp at time t by 4 pi (v . d) t / lambda, which differs from direction d to
-    direction: one compensation serves while its error at the edge of the field of view stays below 0.03 rad rms over
+    direction: one compensation serves while its error at the edge of the field of view stays below 0.01 rad rms over
     the row, beyond that the transmitters' positions are corrected (edge/dsp/steering.py). What becomes of the loops is
     chosen frame by frame; ``last_report`` says what and why.
 
@@ -327,10 +327,11 @@ class Imager:
             return heatmap
         if summed:
             self._order_channels(self._phasors, 0)
-        self._steering.run(self._cube, forward_m_s, along_m_s, 1 if summed else choice.loops, self._power)
+        loops = 1 if summed else choice.loops
+        motion = self._steering.run(self._cube, forward_m_s, along_m_s, loops, self._power)
         if summed and choice.loops > 1:
             self._power *= np.float32(1.0 / choice.loops**2)
-        return replace(heatmap, range_drift_m=self._steering.range_drift_m)
+        return replace(heatmap, motion=motion)
 
     def _run_angle(self, sector: tdm.Sector) -> None:
         """Fill the sector's rows of ``_power`` from ``_spectra`` and ``_phasor``."""

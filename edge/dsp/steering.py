@@ -2,9 +2,10 @@
 """Steering by odometry: loops and slots summed towards every direction with the rig's motion inside the burst undone.
 
 A static point in direction u closes in by c(u) = v_x sqrt(1 - u^2) + v_along u. Within a sector around u_g, c is taken
-as c_g + c'_g (u - u_g): the constant turns each chirp's phase, the slope moves each transmitter by 2 c'_g t along the
-array. The moved elements stand on no grid any more; they are spread on it (non-uniform FFT, Dutt and Rokhlin 1993) with
-weights that make up for their density. Only v_x bends c(u), so travel along the array needs one sector at any speed.
+as c_g + c'_g (u - u_g), the tangent moved to the middle of the curve's bow: the constant turns each chirp's phase, the
+slope moves each transmitter by 2 c'_g t along the array. The moved elements stand on no grid any more; they are spread
+on it (non-uniform FFT, Dutt and Rokhlin 1993) with weights that make up for their density. Only v_x bends c(u), so
+travel along the array needs one sector at any speed.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from edge.dsp import tables, tdm
 from edge.dsp.kernels_doppler import FINE, FRACTIONS, SPREAD_SHAPE, TAPS, plan_spreading, set_turns, spread
 from edge.dsp.kernels_heatmap import angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
-from edge.frames import Float32, Float64
+from edge.frames import BurstMotion, Float32, Float64
 
-BEND_RAD = 0.3
-"""Phase of the first and last chirp at a sector's edge that the straight line may be wrong by."""
+BEND_RAD = 0.15
+"""Phase of the first and last chirp by which c(u) may bow out of its tangent within a sector; half of it remains."""
 MOST_SECTORS = 16
 MARGIN = TAPS + 2
 """Grid cells beyond the outermost elements."""
@@ -61,7 +62,6 @@ class Steering:
         self._cells = float(bins - geometry.count - 2 * MARGIN)
         self._position = channels.element - 0.5 * (geometry.count - 1)
         self._used = np.unique(channels.slot)
-        self._cosine = direction_cosine
         self._sectors = tuple(tdm.divide(direction_cosine, count) for count in range(1, MOST_SECTORS + 1))
         fine = np.arange(-DENSITY_REACH * FINE, DENSITY_REACH * FINE + 1) / FINE
         self._density = np.square(np.sinc(DENSITY_SHARE * fine))
@@ -87,8 +87,6 @@ class Steering:
         self._twiddle = tables.twiddles(bins, +1, 0)
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
         self._work = np.zeros(2 * bins * ANGLE_LANES, dtype=np.float32)
-        self.range_drift_m = np.zeros(bins, dtype=np.float32)
-        """What motion up to the middle of the last burst took off the range, [angle]."""
 
     def loops_that_fit(self, forward_m_s: float, along_m_s: float, most: int) -> int:
         """Loops whose moved elements stay within the angle FFT's length."""
@@ -98,26 +96,33 @@ class Steering:
             return most
         return max(1, int(self._cells * self._unit_m / (drift_m_s * loop_s)))
 
-    def run(self, cube: Float32, forward_m_s: float, along_m_s: float, loops: int, power: Float32) -> None:
-        """Fill ``power`` [angle, range] from ``loops`` of ``cube`` [channel, loop, (re, im), range]."""
+    def run(self, cube: Float32, forward_m_s: float, along_m_s: float, loops: int, power: Float32) -> BurstMotion:
+        """Fill ``power`` [angle, range] from ``loops`` of ``cube`` [channel, loop, (re, im), range].
+
+        Returns:
+            The motion, with the instant whose scene ``power`` shows.
+        """
         first_s, last_s = float(self._time_s[0, self._used[0]]), float(self._time_s[loops - 1, self._used[-1]])
         middle_s = 0.5 * (first_s + last_s)
         np.subtract(self._time_s, middle_s, out=self._centred_s)
-        for sector in self._sectors[self._sector_count(forward_m_s, 0.5 * (last_s - first_s)) - 1]:
+        for sector in self.sectors(forward_m_s, loops):
             across = math.sqrt(1.0 - sector.centre**2)
             slope_m_s = along_m_s - forward_m_s * sector.centre / across
             closing_m_s = forward_m_s * across + along_m_s * sector.centre
+            bend_m_s = -0.5 * forward_m_s / across**3
+            closing_m_s += 0.5 * bend_m_s * sector.half_width**2
             self._run_sector(cube, sector, closing_m_s, slope_m_s, loops, power)
-            rows = slice(sector.first, sector.last)
-            self.range_drift_m[rows] = closing_m_s + slope_m_s * (self._cosine[rows] - sector.centre)
-        self.range_drift_m *= np.float32(middle_s)
+        return BurstMotion(middle_s, forward_m_s, along_m_s)
 
-    def _sector_count(self, forward_m_s: float, half_s: float) -> int:
-        """Sectors in which the straight line departs from sqrt(1 - u^2), bent by 1.54 at u = 1/2, by BEND_RAD."""
+    def sectors(self, forward_m_s: float, loops: int) -> tuple[tdm.Sector, ...]:
+        """Sectors in which the tangent departs from sqrt(1 - u^2), bent by 1.54 at u = 1/2, by BEND_RAD."""
+        first_s, last_s = float(self._time_s[0, self._used[0]]), float(self._time_s[loops - 1, self._used[-1]])
+        half_s = 0.5 * (last_s - first_s)
         bend_rad = 4.0 * math.pi / self._wavelength_m * 1.54 * abs(forward_m_s) * half_s
         if bend_rad * tdm.FOV_COSINE**2 <= 2.0 * BEND_RAD:
-            return 1
-        return min(math.ceil(tdm.FOV_COSINE / math.sqrt(2.0 * BEND_RAD / bend_rad)), MOST_SECTORS)
+            return self._sectors[0]
+        count = min(math.ceil(tdm.FOV_COSINE / math.sqrt(2.0 * BEND_RAD / bend_rad)), MOST_SECTORS)
+        return self._sectors[count - 1]
 
     def _run_sector(
         self, cube: Float32, sector: tdm.Sector, closing_m_s: float, slope_m_s: float, loops: int, power: Float32

@@ -134,10 +134,12 @@ class Sector:
 
     Args:
         centre: direction cosine that is compensated exactly.
+        half_width: from the centre to either edge.
         first, last: rows first <= row < last.
     """
 
     centre: float
+    half_width: float
     first: int
     last: int
 
@@ -153,4 +155,7 @@ def divide(direction_cosine: Float64, count: int) -> tuple[Sector, ...]:
     rows = np.searchsorted(direction_cosine, bounds)
     rows[0], rows[-1] = 0, len(direction_cosine)
     centres = 0.5 * (bounds[1:] + bounds[:-1])
-    return tuple(Sector(float(c), int(a), int(b)) for c, a, b in zip(centres, rows[:-1], rows[1:], strict=True))
+    return tuple(
+        Sector(float(c), FOV_COSINE / count, int(a), int(b))
+        for c, a, b in zip(centres, rows[:-1], rows[1:], strict=True)
+    )

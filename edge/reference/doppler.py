@@ -45,19 +45,19 @@ def steered_power(
     antenna: AntennaSettings,
     loops: int,
     velocity_m_s: tuple[float, float],
-    sectors: Sequence[tuple[float, int, int]],
+    sectors: Sequence[tuple[float, float, int, int]],
 ) -> Float64:
     """Power over direction cosine and range with the rig's motion undone for a static scene.
 
     Row b in the sector around u_g sums w exp(j 2 pi (p u_b + 2 (c_g + c'_g (u_b - u_g)) t) / lambda) X over channels
     and loops, c(u) = v_x sqrt(1 - u^2) + v_along u, t from the middle between the row's first and last chirp, with the
-    density weights of p + 2 c'_g t.
+    density weights of p + 2 c'_g t; c_g stands in the middle of c's bow, c'' h^2 / 4 off the tangent.
 
     Args:
         radar, frame, settings, antenna: as for ``range_angle_power``.
         loops: loops that are used.
         velocity_m_s: along boresight and along the array.
-        sectors: (centre u_g, first row, last row + 1).
+        sectors: (centre u_g, half width h, first row, last row + 1).
     Returns:
         float64 [angle, range].
     """
@@ -74,9 +74,10 @@ def steered_power(
     u = direction_cosines(radar, settings)
     power = np.zeros((len(u), spectrum.shape[-1]))
     forward, along = velocity_m_s
-    for centre, first, last in sectors:
+    for centre, half_width, first, last in sectors:
         across = np.sqrt(1.0 - centre**2)
         slope, closing = along - forward * centre / across, forward * across + along * centre
+        closing -= 0.25 * forward / across**3 * half_width**2
         moved_m = p[None, :] + 2.0 * slope * time_s
         weight = density_weights(moved_m.ravel() / unit_m, settings).reshape(moved_m.shape)
         rows = u[first:last, None, None]

@@ -123,10 +123,11 @@ def test_kernel_agrees_with_the_definition(window, focus):
     settings = HeatmapSettings(range_window=window, angle_window=window, focus=focus)
     frame = noisy_scene(radar, 1)
     imager = Imager(radar, settings, AntennaSettings())
-    heatmap = imager.process(frame, np.array([0.2, 0.0, 0.0]))
-    closing_m_s = 0.5 * (1.0 + np.sqrt(0.5)) * 0.2
+    heatmap = imager.process(frame, np.array([0.1, 0.0, 0.0]))
+    closing_m_s = 0.5 * (1.0 + np.sqrt(0.5)) * 0.1
     expected = range_angle_power(radar, frame, settings, AntennaSettings(), imager.last_report.loops, closing_m_s)
     assert imager.last_report.loops == 3
+    assert heatmap.motion is None
     assert np.abs(heatmap.power - expected).max() < 1e-5 * expected.max()
 
 
