@@ -46,6 +46,7 @@ RAW_SCENES = 20
 NEAR_M, FAR_M, COVERED_M, SUPPORT_M = 0.1, 0.2, 0.15, 0.1
 PRODUCTION = ("paper", "paper, sidelobes out", "optimal, sidelobes kept", "optimal")
 MARGIN = 1.5
+AMBIGUOUS = f"optimal, ambiguous pairs (< {MARGIN} nats) dropped"
 
 
 @dataclass(slots=True)
@@ -139,9 +140,7 @@ def alternatives(rig: Rig) -> dict[str, Rule]:
         "greedy, worthiest pair first": rule(greedy),
         "mutual best": rule(lambda value: sure(value, 0.0)),
         f"mutual best by {MARGIN} nats": rule(lambda value: sure(value, MARGIN)),
-        f"optimal, ambiguous pairs (< {MARGIN} nats) dropped": rule(
-            lambda value: sorted(set(worthiest(value)) & set(sure(value, MARGIN)))
-        ),
+        AMBIGUOUS: rule(lambda value: sorted(set(worthiest(value)) & set(sure(value, MARGIN)))),
         "optimal, by range alone": rule(worthiest, level_scale_db=1e6),
         "optimal, Swerling I level scale (4.34 dB)": rule(worthiest, level_scale_db=10.0 / np.log(10.0)),
         "optimal, level scale 2 dB": rule(worthiest, level_scale_db=2.0),
@@ -288,7 +287,7 @@ def drive_table(rig: Rig) -> tuple[list[str], list[tuple[str, dict[str, Window]]
     lines = head("drive, rule", *names, "supported", "supported: within 10 cm", "shape CD cm")
     results = []
     for drive in drives(rig):
-        rules = production(rig)
+        rules = production(rig) | {AMBIGUOUS: alternatives(rig)[AMBIGUOUS]}
         windows = {name: window(drive, rule) for name, rule in rules.items()}
         results.append((drive.name, windows))
         for name, w in windows.items():
