@@ -48,7 +48,6 @@ def test_array_peers_make_the_same_heatmap_and_detections(radar: RadarId, peer_c
     assert np.mean(decided != peer.decided(power)) < 1e-4
     found, theirs = ROAD.one(radar), peer.detect(frame)
     assert covered(ours, found, theirs) == len(found) >= 10  # the peer also has sidelobes, which we leave out
-    assert len(theirs) < 2 * len(found)
 
 
 def test_the_ordered_statistic_of_scipy_decides_alike_away_from_the_ends_of_range() -> None:

@@ -18,7 +18,7 @@ from numba.core.runtime import _nrt_python, rtsys
 import edge.dsp
 import edge.fusion
 from edge.bench.cases import Road, Scene
-from edge.config import CfarKind, FusionSettings
+from edge.config import CfarKind, DopplerChoice, FusionSettings
 from edge.frames import PointCloud, Pose
 from edge.fusion.temporal import TemporalFusion
 from edge.rig import load_rig
@@ -58,7 +58,7 @@ def modules() -> Iterator[Any]:
             yield importlib.import_module(entry.name)
 
 
-def drive(loops: int, kind: CfarKind, doppler: str) -> tuple[Road, Run]:
+def drive(loops: int, kind: CfarKind, doppler: DopplerChoice) -> tuple[Road, Run]:
     """A road and a call that sends frames along it; no window of travel ends meanwhile."""
     scene = Scene(load_rig("cascade_demo"), loops, VELOCITY_M_S)
     road, fusion = Road(scene, kind, doppler), TemporalFusion(FusionSettings(travel_m=1000.0, max_time_s=1000.0))
@@ -83,7 +83,7 @@ def drive(loops: int, kind: CfarKind, doppler: str) -> tuple[Road, Run]:
     ("loops", "kind", "doppler"), [(1, "ca", "sum"), (1, "os", "sum"), (2, "so", "steer"), (2, "ca", "fft")]
 )
 def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(
-    loops: int, kind: CfarKind, doppler: str, monkeypatch: pytest.MonkeyPatch
+    loops: int, kind: CfarKind, doppler: DopplerChoice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     road, run = drive(loops, kind, doppler)
     seen: Counter[str] = Counter()

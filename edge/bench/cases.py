@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from edge.bench.array_peers import NumpyPeer, ScipyPeer, ScipyRankPeer
 from edge.bench.package_peers import MmwcorePeer, OpenRadarPeer, OpenRadarRankPeer, XwrPeer
 from edge.bench.peer import Peer, covered
 from edge.bench.two_cores import TwoCores
-from edge.config import CFAR_KINDS, CfarKind, CfarSettings, HeatmapSettings
+from edge.config import CFAR_KINDS, CfarKind, CfarSettings, DopplerChoice, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.errors import DependencyError
@@ -103,10 +102,12 @@ class Scene:
             r: make_frame(radars[r], self.reflectors_m, amplitude, 0, 0, velocity_m_s, NOISE_LSB, rng) for r in RADARS
         }
 
-    def settings(self, kind: CfarKind, doppler: str = "sum") -> tuple[HeatmapSettings, CfarSettings]:
-        """The rig's with another detector and another use of loops."""
-        changed: dict[str, Any] = {"doppler": doppler} if offers_doppler() else {}
-        return replace(self.rig.settings.heatmap, **changed), replace(self.rig.settings.cfar, kind=kind)
+    def settings(
+        self, kind: CfarKind, doppler: DopplerChoice = "sum", elevation: bool = True
+    ) -> tuple[HeatmapSettings, CfarSettings]:
+        """The rig's with another detector, another use of loops, with or without the chirps of the elevation rows."""
+        heatmap = replace(self.rig.settings.heatmap, doppler=doppler, read_elevation=elevation)
+        return heatmap, replace(self.rig.settings.cfar, kind=kind)
 
     def found(self, cloud: PointCloud) -> int:
         """Reflectors with a point nearby."""
@@ -118,13 +119,12 @@ class Road:
     """Our chain: raw frames of both radars to associated points.
 
     Args:
-        scene: rig and frames.
-        kind, doppler: detector, use of loops.
-        velocity_m_s: of the rig.
+        scene: rig, frames and velocity.
+        kind, doppler, elevation: as ``Scene.settings`` takes them.
     """
 
-    def __init__(self, scene: Scene, kind: CfarKind, doppler: str = "sum", velocity_m_s: Float64 | None = None) -> None:
-        heatmap, cfar = scene.settings(kind, doppler)
+    def __init__(self, scene: Scene, kind: CfarKind, doppler: DopplerChoice = "sum", elevation: bool = True) -> None:
+        heatmap, cfar = scene.settings(kind, doppler, elevation)
         rig, self._frames, self._velocity_m_s = scene.rig, scene.frames, scene.velocity_m_s
         self.imagers = {r: Imager(rig.radars[r], heatmap, rig.settings.antenna) for r in RADARS}
         self.detectors = {r: Detector(rig.radars[r], cfar) for r in RADARS}
@@ -145,11 +145,6 @@ class Road:
         return self.associator.process(horizontal, vertical, self._velocity_m_s)  # type: ignore[arg-type]
 
 
-def offers_doppler() -> bool:
-    """Whether the imager can keep Doppler."""
-    return "doppler" in {entry.name for entry in fields(HeatmapSettings)}
-
-
 def whole_frames(rig: Rig, cores: TwoCores, errors: dict[str, str]) -> list[Case]:
     """Two-radar frames, raw int16 to associated points, with their peers.
 
@@ -158,24 +153,27 @@ def whole_frames(rig: Rig, cores: TwoCores, errors: dict[str, str]) -> list[Case
         cores: for the case on two cores.
         errors: receives peer -> why it cannot be measured.
     """
-    one, eight = Scene(rig, 1), Scene(rig, LOOPS)
-    road = Road(one, "ca")
-    cases = [
+    one, eight, moving = Scene(rig, 1), Scene(rig, LOOPS), Scene(rig, LOOPS, PASSING_M_S)
+    road, kept = Road(one, "ca"), Road(eight, "ca", "fft")
+    return [
         _case("one loop, CA", one, road, 0.5, _contenders(one, "ca", errors)),
+        _case("one loop, CA, elevation rows not read", one, Road(one, "ca", elevation=False)),
         _case("one loop, OS", one, Road(one, "os"), 1.0, _contenders(one, "os", errors)),
         _case("8 loops summed, CA", eight, Road(eight, "ca"), 0.9, _contenders(eight, "ca", errors, (ScipyPeer,))),
+        _case("8 loops steered at 3 m/s, CA", moving, Road(moving, "ca", "steer")),
+        _case("8 loops, Doppler kept, CA", eight, kept, 4.0),
+        _on_two_cores("one loop, CA, two cores", one, road, 0.35, cores),
+        _on_two_cores("8 loops, Doppler kept, CA, two cores", eight, kept, None, cores),
     ]
-    if offers_doppler():
-        moving = Scene(rig, LOOPS, PASSING_M_S)
-        cases.append(_case("8 loops steered at 3 m/s, CA", moving, Road(moving, "ca", "steer"), None))
-        cases.append(_case("8 loops, Doppler kept, CA", eight, Road(eight, "ca", "fft"), 4.0))
-    again = road()
-    threaded = partial(road.threaded, cores)
-    cases.append(Case("one loop, CA, two cores", threaded, 0.35, one.found(again), len(again), cores=2))
-    return cases
 
 
-def _case(name: str, scene: Scene, road: Road, goal_ms: float | None, peers: tuple[Contender, ...] = ()) -> Case:
+def _on_two_cores(name: str, scene: Scene, road: Road, goal_ms: float | None, cores: TwoCores) -> Case:
+    call = partial(road.threaded, cores)
+    cloud = call()
+    return Case(name, call, goal_ms, scene.found(cloud), len(cloud), cores=2)
+
+
+def _case(name: str, scene: Scene, road: Road, goal_ms: float | None = None, peers: tuple[Contender, ...] = ()) -> Case:
     cloud = road()
     return Case(name, road, goal_ms, scene.found(cloud), len(cloud), peers)
 

@@ -37,7 +37,7 @@ class OpenRadarPeer(Peer):
     """OpenRadar: complex128 range FFT, Bartlett beamformer as a matrix product, cell averaging along either axis."""
 
     distribution = "openradar"
-    differences = "complex128; cross of 12 + 16 cells instead of a ring, on logarithms; whole bins"
+    differences = "complex128; Hann in range; means along either axis instead of a ring, of logarithms; whole bins"
 
     def __init__(self, radar: Radar, heatmap: HeatmapSettings, antenna: AntennaSettings, cfar: CfarSettings) -> None:
         super().__init__(radar, heatmap, antenna, cfar)
@@ -73,7 +73,7 @@ class OpenRadarPeer(Peer):
 class OpenRadarRankPeer(OpenRadarPeer):
     """The same with ordered statistics along either axis."""
 
-    differences = "complex128; rank of 12 and of 16 cells instead of a ring of 428; whole bins"
+    differences = "complex128; Hann in range; ranks along either axis, guard cells left out on one side only; whole bins"
 
     def cells(self, image: Any) -> tuple[Cells, Float32]:
         """Above the ranks of both axes: ``os_`` line by line."""
@@ -94,7 +94,7 @@ class XwrPeer(Peer):
     """xwr: FFTW, pad, FFT and shift over the row, ring mean by ``scipy.signal.convolve2d``."""
 
     distribution = "xwr"
-    differences = "angle axis not periodic in the CFAR; adds 1 to the power; whole bins"
+    differences = "Hann in range; angle axis not periodic in the CFAR; adds 1 to the power; whole bins"
 
     def __init__(self, radar: Radar, heatmap: HeatmapSettings, antenna: AntennaSettings, cfar: CfarSettings) -> None:
         super().__init__(radar, heatmap, antenna, cfar)
@@ -136,7 +136,9 @@ class MmwcorePeer(Peer):
     """mmwcore: decoding, windowed FFTs and a two-dimensional ring in Rust."""
 
     distribution = "mmwcore"
-    differences = "square ring 17 x 17 - 5 x 5 on amplitudes, cells within 8 of an edge never tested; whole bins"
+    differences = (
+        "Hann in range; square ring 17 x 17 - 5 x 5 on amplitudes, cells within 8 of an edge never tested; whole bins"
+    )
     GUARD, TRAIN = 2, 6
 
     def __init__(self, radar: Radar, heatmap: HeatmapSettings, antenna: AntennaSettings, cfar: CfarSettings) -> None:
