@@ -8,8 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge.best_shapes import keep_best
-from edge.completion.model import UNKNOWN
+from edge.best_shapes import class_text, keep_best
 from edge.frames import Shape
 from edge.pipeline import FrameResult, Pipeline, WindowResult
 from edge.stream.convert import shape_size_m
@@ -107,19 +106,10 @@ def _dead(pipeline: Pipeline) -> dict[str, tuple[str, ...]]:
     return {radar: names for radar, names in pipeline.faults.dead_channels.items() if names}
 
 
-def _class_text(shape: Shape) -> str:
-    """The class; when that is unknown the most likely one with its probability, "unknown (car 0.95?)"."""
-    known = {name: share for name, share in shape.class_probability.items() if name != UNKNOWN}
-    if shape.class_name != UNKNOWN or not known:
-        return shape.class_name
-    likely = max(known, key=lambda name: known[name])
-    return f"{UNKNOWN} ({likely} {known[likely]:.2f}?)"
-
-
 def _shape_line(shape: Shape) -> str:
     facts = shape_as_dict(shape)
     size = " x ".join(f"{side:.2f}" for side in facts["size_m"])
     return (
-        f"object {shape.identity}: {_class_text(shape)} (confidence {shape.confidence:.2f}), "
+        f"object {shape.identity}: {class_text(shape)} (confidence {shape.confidence:.2f}), "
         f"{size} m, from {shape.input_points} radar points of {shape.input.frames} frames"
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from edge.best_shapes import class_text
 from edge.frames import Float32, Shape
 from edge.plot.figure import BOTH, COARSE, GRID, INK, INPUT, MUTED, new_figure, write
 
@@ -31,7 +32,7 @@ def shape_picture(path: Path, shape: Shape, subtitle: str, truth_m: Float32 | No
     ]
     if truth_m is not None:
         columns.append((f"truth ({len(truth_m)})", INK, truth_m, 0.7))
-    title = f"Object {shape.identity}: {shape.class_name} (confidence {shape.confidence:.2f})"
+    title = f"Object {shape.identity}: {class_text(shape)} (confidence {shape.confidence:.2f})"
     figure = new_figure(4.1 * len(columns), 7.6, title, subtitle)
     together = np.concatenate([points for _, _, points, _ in columns])
     low, high = together.min(axis=0), together.max(axis=0)
