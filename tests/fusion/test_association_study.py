@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge.bench.studies.association import PRODUCTION, Score, alternatives, greedy, production, scored, sure
+from edge.bench.studies.association import PRODUCTION, Score, alternatives, greedy, production, renewed, scored, sure
 from edge.bench.studies.association_scenes import LEVELS, RAWS, Level, detection_scene, person, raw_scenes
 from edge.rig import load_rig
 
@@ -21,6 +21,12 @@ def test_score_counts_right_points_and_found_reflectors() -> None:
     assert (score.frames, score.points, score.near, score.far, score.found, score.sought) == (2, 3, 1, 2, 2, 4)
     assert score.precision == (1 / 3, 2 / 3)
     assert (score.recall, score.per_frame) == (0.5, 1.5)
+
+
+def test_tables_of_a_document_are_renewed_by_their_first_heading() -> None:
+    text = "a\n\n| x | y |\n|---|---:|\n| 1 | 2 |\n| 3 | 4 |\n\nb\n| other | y |\n|---|---:|\n"
+    expected = "a\n\n| x | z |\n|---|---:|\n| 9 | 8 |\n\nb\n| other | y |\n|---|---:|\n"
+    assert renewed(text, ["", "| x | z |", "|---|---:|", "| 9 | 8 |", "", "| new | w |", "", "picture: p"]) == expected
 
 
 def test_greedy_is_not_optimal_and_sure_pairs_have_no_rival() -> None:
@@ -57,7 +63,8 @@ def test_the_default_beats_the_paper_s_rule_in_precision_and_recall() -> None:
 def test_sidelobes_of_strong_reflectors_make_no_points() -> None:
     scores = scored(production(RIG), raw_scenes(np.random.default_rng(2), RAWS[1], RIG, 4))
     assert set(scores) == set(PRODUCTION)
-    assert scores["optimal"].precision[1] > 0.9 > scores["optimal, sidelobes kept"].precision[1]
+    assert scores["optimal"].precision[1] > 0.95
+    assert scores["optimal"].precision[1] >= scores["optimal, sidelobes kept"].precision[1]
     assert scores["optimal"].recall > 0.8
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Study of the association: precision and recall of 3-D points by rule, on scenes with known truth.
 
-``python -m edge.bench.studies.association [--plot DIR]`` prints the tables of docs/signal_path.md, "Association", in
-about two minutes on one core. Everything is seeded.
+``python -m edge.bench.studies.association [--plot DIR] [--update FILE]`` prints the tables of docs/signal_path.md,
+"Association", in about two minutes on one core, or renews them there. Everything is seeded.
 """
 
 from __future__ import annotations
@@ -303,7 +303,7 @@ def drive_table(rig: Rig) -> tuple[list[str], list[tuple[str, dict[str, Window]]
 
 def speed_table(rig: Rig) -> list[str]:
     """Both rules on crowded frames."""
-    lines = head(f"{processor()}, one thread", "median ms", "p99 ms")
+    lines = head("time of one frame", f"median ms, one thread of {processor()}", "p99 ms")
     return lines + [row(name, f"{t.median_ms:.3f}", f"{t.p99_ms:.3f}") for name, t in speed(rig).items()]
 
 
@@ -353,16 +353,34 @@ def report(rig: Rig, folder: Path | None) -> Iterator[str]:
         yield f"\npicture: {picture(folder / 'association.png', by_level, results[0])}"
 
 
+def renewed(text: str, lines: Iterable[str]) -> str:
+    """A document with its tables replaced by those in ``lines`` that have the same first heading."""
+    old = text.split("\n")
+    for table in "\n".join(lines).split("\n\n"):
+        new = table.strip().split("\n")
+        heading = new[0].split("|")[:2]
+        starts = [n for n, line in enumerate(old) if line.startswith("|") and line.split("|")[:2] == heading]
+        for start in starts[:1]:
+            end = next((n for n in range(start, len(old)) if not old[n].startswith("|")), len(old))
+            old[start:end] = new
+    return "\n".join(old)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--rig", default="cascade_demo", help="rig with two cascade radars (default: %(default)s)")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="write a picture there")
+    parser.add_argument("--update", type=Path, metavar="FILE", help="renew the tables of this document")
     args = parser.parse_args()
     if args.plot is not None:
         prepare_folder(args.plot)
+    lines = []
     for line in report(load_rig(args.rig), args.plot):
         print(line, flush=True)
+        lines += line.split("\n")
+    if args.update is not None:
+        args.update.write_text(renewed(args.update.read_text(encoding="utf-8"), lines), encoding="utf-8")
 
 
 if __name__ == "__main__":
