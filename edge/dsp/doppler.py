@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edge.config import HeatmapSettings
 from edge.dsp import tables
-from edge.dsp.kernels_doppler import doppler_fft, doppler_row, resolve_folds, strongest_bin
+from edge.dsp.kernels_doppler import doppler_fft, doppler_row, keep_larger, resolve_folds
 from edge.dsp.kernels_heatmap import angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
 from edge.frames import DopplerMaps, Float32, Heatmap
@@ -98,7 +98,7 @@ class DopplerFft:
                 *(self._row, self._twiddle, self._target, self._gain, 0, len(power), self._angle_work),
                 self.maps.power[d],
             )
-        strongest_bin(self.maps.power, power)
+            keep_larger(self.maps.power[d], float(d > 0), power)
 
 
 def speeds_m_s(maps: DopplerMaps, angle: NDArray[np.int64], range_bin: NDArray[np.int64]) -> Float32:

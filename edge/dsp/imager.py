@@ -20,7 +20,7 @@ from edge.dsp.effective_cells import noise_correlation
 from edge.dsp.elevation import ElevationRows
 from edge.dsp.interpolation import fit_response
 from edge.dsp.kernels_checks import all_zero, dead_channels
-from edge.dsp.kernels_doppler import channel_kernel
+from edge.dsp.kernels_doppler import PADDING, channel_kernel
 from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
 from edge.dsp.row import RowGeometry
 from edge.dsp.steering import Steering
@@ -209,7 +209,7 @@ class Imager:
         self._aligned = np.zeros(layout.int16_count // 2, dtype=np.int32)
         self._dead = np.zeros((layout.slots, layout.devices * layout.rx), dtype=np.uint8)
         loops = tables.next_power_of_two(self._most_loops)
-        self._cube = np.zeros((len(self._channels.slot), loops, 2, self.points), dtype=np.float32)
+        self._cube = np.zeros((len(self._channels.slot), loops, 2, self.points + PADDING), dtype=np.float32)
         time_s = self._transmit_time_s + self._loop_time_s * np.arange(self._most_loops)[:, None]
         self._steering = Steering(
             *(self.geometry, self._channels, self.settings, time_s, self._wavelength_m, self.points, self._gain),

@@ -2,7 +2,8 @@
 """Kernels over loops: channels in order, moved elements spread on the row's grid, Doppler FFT, folds, strongest bin.
 
 A channel is one (slot, receiver) of the row. ``cube`` holds the channels' focused range spectra, [channel, loop,
-(re, im), range]; range innermost, so that every inner loop runs along it.
+(re, im), range + PADDING]; range innermost, so that every inner loop runs along it. The padding keeps a channel's rows
+from sharing the low bits of their addresses, which would stall loads behind stores.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numba import complex64, float32, float64, int8, int64, njit, types, uint64
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
+PADDING = 16
 TAPS = 6
 """Grid cells that one moved element is spread on."""
 SPREAD_SHAPE = 12.0
@@ -171,20 +173,20 @@ def spread(cube, slot, loops, turn, first, taps, line, row):  # type: ignore[no-
         line: float32 [2, range] scratch.
         row: float32 [(re, im), cell, range], overwritten.
     """
-    points = cube.shape[3]
+    points = row.shape[2]
     row[:] = float32(0)
     for c in range(len(slot)):
         for l in range(loops):  # noqa: E741
-            tr, ti = turn[l, slot[c]].real, turn[l, slot[c]].imag
+            tr, ti, source = turn[l, slot[c]].real, turn[l, slot[c]].imag, cube[c, l]
             for k in range(points):
-                re, i = cube[c, l, 0, k], cube[c, l, 1, k]
-                line[0, k] = re * tr - i * ti
-                line[1, k] = re * ti + i * tr
+                line[0, k] = source[0, k] * tr - source[1, k] * ti
+                line[1, k] = source[0, k] * ti + source[1, k] * tr
             for j in range(TAPS):
-                cell, tap = uint64(first[l, c] + j), taps[l, c, j]
-                for k in range(points):
-                    row[0, cell, k] += tap * line[0, k]
-                    row[1, cell, k] += tap * line[1, k]
+                cell, tap = first[l, c] + j, taps[l, c, j]
+                for part in range(2):
+                    target, turned = row[part, cell], line[part]
+                    for k in range(points):
+                        target[k] += tap * turned[k]
 
 
 @njit(types.void(float32[:, :, :, ::1], float32[:, ::1]), **OPTIONS)
@@ -203,15 +205,14 @@ def doppler_fft(cube, twiddle):  # type: ignore[no-untyped-def]
             for start in range(0, loops, 2 * half):
                 for n in range(half):
                     wr, wi = twiddle[0, n * step], twiddle[1, n * step]
-                    upper, lower = uint64(start + n), uint64(start + n + half)
+                    upper, lower = cube[c, start + n], cube[c, start + n + half]
                     for k in range(points):
-                        ar, ai = cube[c, upper, 0, k], cube[c, upper, 1, k]
-                        br, bi = cube[c, lower, 0, k], cube[c, lower, 1, k]
+                        ar, ai, br, bi = upper[0, k], upper[1, k], lower[0, k], lower[1, k]
                         dr, di = ar - br, ai - bi
-                        cube[c, upper, 0, k] = ar + br
-                        cube[c, upper, 1, k] = ai + bi
-                        cube[c, lower, 0, k] = dr * wr - di * wi
-                        cube[c, lower, 1, k] = dr * wi + di * wr
+                        upper[0, k] = ar + br
+                        upper[1, k] = ai + bi
+                        lower[0, k] = dr * wr - di * wi
+                        lower[1, k] = dr * wi + di * wr
             half //= 2
 
 
@@ -246,7 +247,7 @@ def resolve_folds(cube, d, pairs, distances, hypothesis, work, score, fold):  # 
         score: float32 [range] scratch.
         fold: int8 [range], receives the index of the hypothesis.
     """
-    points, bin_ = cube.shape[3], uint64(d)
+    points, bin_ = len(score), uint64(d)
     work[:] = float32(0)
     for n in range(len(pairs)):
         a, b, g = uint64(pairs[n, 0]), uint64(pairs[n, 1]), uint64(pairs[n, 2])
@@ -285,7 +286,7 @@ def doppler_row(cube, d, slot, element, turns, fold, turn, row):  # type: ignore
         turn: float32 [slot, (re, im), range] scratch.
         row: [(re, im), element, range], overwritten.
     """
-    points, bin_ = cube.shape[3], uint64(d)
+    points, bin_ = row.shape[2], uint64(d)
     for s in range(turn.shape[0]):
         for k in range(points):
             turn[s, 0, k] = turns[fold[k], s, 0]
@@ -299,13 +300,9 @@ def doppler_row(cube, d, slot, element, turns, fold, turn, row):  # type: ignore
             row[1, e, k] += re * ti + i * tr
 
 
-@njit(types.void(float32[:, :, ::1], float32[:, ::1]), **OPTIONS)
-def strongest_bin(maps, power):  # type: ignore[no-untyped-def]
-    """Largest of all Doppler bins; maps [Doppler, angle, range], power [angle, range] is overwritten."""
-    bins, angles, points = maps.shape
-    for a in range(angles):
-        for k in range(points):
-            power[a, k] = maps[0, a, k]
-        for d in range(1, bins):
-            for k in range(points):
-                power[a, k] = max(power[a, k], maps[d, a, k])
+@njit(types.void(float32[:, ::1], float32, float32[:, ::1]), **OPTIONS)
+def keep_larger(other, keep, power):  # type: ignore[no-untyped-def]
+    """power = max(keep power, other), both [angle, range] and not negative; ``keep`` 0 forgets what was there."""
+    for a in range(power.shape[0]):
+        for k in range(power.shape[1]):
+            power[a, k] = max(power[a, k] * keep, other[a, k])

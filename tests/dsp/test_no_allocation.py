@@ -20,11 +20,11 @@ from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
 from edge.dsp.kernels_doppler import (
     doppler_fft,
     doppler_row,
+    keep_larger,
     plan_spreading,
     resolve_folds,
     set_turns,
     spread,
-    strongest_bin,
 )
 from edge.dsp.kernels_heatmap import set_phasors
 from edge.reference.point_targets import make_frame
@@ -60,12 +60,12 @@ def motion_kernels(way, imager):
     """Kernels between the range FFT and the power of one frame of two loops, in one sector."""
     steering, doppler = imager._steering, imager._doppler
     steered = [plan_spreading, set_turns, spread, steering._angle_kernels[0]]
-    by_bin = [resolve_folds, doppler_row, doppler._angle_kernel]
+    by_bin = [resolve_folds, doppler_row, doppler._angle_kernel, keep_larger]
     return {
         "sum": [set_phasors, imager._row_kernel, imager._angle_kernel],
         "moved sum": [imager._channel_kernel, *steered],
         "steer": [imager._range_kernel, *2 * [imager._channel_kernel], *steered],
-        "fft": [imager._range_kernel, *2 * [imager._channel_kernel], doppler_fft, *2 * by_bin, strongest_bin],
+        "fft": [imager._range_kernel, *2 * [imager._channel_kernel], doppler_fft, *2 * by_bin],
     }[way]
 
 
