@@ -111,6 +111,7 @@ def test_a_start_is_measured_from_outside() -> None:
     measured = start("cascade_demo", "kernels")
     assert 30 < measured.resident_mb < 1000
     assert measured.seconds > 0.1
+    assert measured.cpu_s > 0.1
     assert resident_bytes() > 30e6
     with pytest.raises(RfconstructError, match="a start of kernels failed"):
         start("no such rig", "kernels")
@@ -129,7 +130,7 @@ def result() -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cases, "PEERS_OF", {"ca": ((NumpyPeer, None), (ScipyPeer, 1e6), (MmwcorePeer, 20.0)), "os": ()})
         patch.setattr(cases, "STAGE_PEERS", ((NumpyPeer, "ca"), (ScipyPeer, "ca")))
-        patch.setattr(suite, "start", lambda rig, part, cold=False: Start(99.0 if cold else 1.0, 260.0))
+        patch.setattr(suite, "start", lambda rig, part, cold=False: Start(99.0 if cold else 1.0, 0.9, 260.0))
         patch.setitem(sys.modules, "mmwcore._native", None)
         return suite.run_suite(RIG, 0.1, cold=True)
 
@@ -156,7 +157,7 @@ def test_every_missed_goal_and_every_faster_peer_is_told(result: dict[str, Any])
     told = "\n".join(misses(result))
     assert "one loop, CA: " in told  # a million times faster than SciPy is not reached
     assert "goal 1000000" in told
-    assert "no compiled kernels: 99.0 s, goal 20 s" in told
+    assert "no compiled kernels: ready after 99.0 s (0.9 s of CPU), goal 20 s" in told
     assert "260 MB, goal 250 MB" in told
     first = dict(result["frames"][0], median_ms=1.0, p99_ms=1.5, goal_ms=0.5)
     first["peers"] = [dict(first["peers"][0], ratio=0.5, found=first["found"] + 1)]

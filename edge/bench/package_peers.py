@@ -73,7 +73,7 @@ class OpenRadarPeer(Peer):
 class OpenRadarRankPeer(OpenRadarPeer):
     """The same with ordered statistics along either axis."""
 
-    differences = "complex128; Hann in range; ranks along either axis, guard cells left out on one side only; whole bins"
+    differences = "complex128; Hann in range; ranks along either axis, guard cells left out on one side; whole bins"
 
     def cells(self, image: Any) -> tuple[Cells, Float32]:
         """Above the ranks of both axes: ``os_`` line by line."""

@@ -28,7 +28,8 @@ def lines(result: Result) -> Iterator[str]:
 
 def document(result: Result, command: str) -> str:
     """The content of docs/benchmarks.md."""
-    head = ["# Benchmarks", "", "Written by one command; do not edit:", "", "```", command, "```", ""]
+    needs = "The peers come with `pip install 'rfconstruct[peers]'`; mmwcore needs Python 3.12."
+    head = ["# Benchmarks", "", "Written by one command; do not edit:", "", "```", command, "```", "", needs, ""]
     return "\n".join([*head, *lines(result)]) + "\n"
 
 
@@ -151,7 +152,7 @@ def misses(result: Result) -> Iterator[str]:
     for s in result["starts"]:
         limit_s = COLD_S if s["cold"] else WARM_S
         if s["part"] == "pipeline" and s["seconds"] > limit_s:
-            yield f"{_start_name(s)}: {s['seconds']:.1f} s, goal {limit_s:g} s."
+            yield f"{_start_name(s)}: ready after {s['seconds']:.1f} s ({s['cpu_s']:.1f} s of CPU), goal {limit_s:g} s."
         if s["part"] == "kernels" and s["resident_mb"] > KERNELS_MB:
             yield f"{_start_name(s)}: {s['resident_mb']:.0f} MB, goal {KERNELS_MB:.0f} MB."
 
@@ -208,8 +209,8 @@ def _start_name(entry: Result) -> str:
 def _starts(starts: list[Result]) -> Iterator[str]:
     yield "## Start"
     yield ""
-    rows = [[_start_name(s), f"{s['seconds']:.2f}", f"{s['resident_mb']:.0f}"] for s in starts]
-    yield from table(["process", "ready after s", "resident MB"], rows)
+    rows = [[_start_name(s), f"{s['seconds']:.2f}", f"{s['cpu_s']:.2f}", f"{s['resident_mb']:.0f}"] for s in starts]
+    yield from table(["process", "ready after s", "CPU s", "resident MB"], rows)
     yield (
         f"Interpreter, imports, tables and the first frames included. Goals: {WARM_S:g} s with compiled kernels, "
         f"{COLD_S:g} s without, {KERNELS_MB:.0f} MB for the kernels."

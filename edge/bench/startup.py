@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -28,10 +29,12 @@ class Start:
 
     Args:
         seconds: from its creation until its kernels are ready and its first frames have passed.
-        resident_mb: memory then, 1e6 bytes.
+        cpu_s: CPU time of the whole process, which other processes of a shared machine do not lengthen.
+        resident_mb: memory when it was ready, 1e6 bytes.
     """
 
     seconds: float
+    cpu_s: float
     resident_mb: float
 
 
@@ -48,7 +51,7 @@ def start(rig_name: str, part: Part, cold: bool = False) -> Start:
     with tempfile.TemporaryDirectory() as empty:
         environment = {**os.environ, VARIABLE: empty} if cold else dict(os.environ)
         command = [sys.executable, "-m", "edge.bench.startup", rig_name, part]
-        begin_s = time.monotonic()
+        begin_s, begin_cpu_s = time.monotonic(), _children_cpu_s()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
             assert process.stdout is not None
             line = process.stdout.readline()
@@ -56,7 +59,12 @@ def start(rig_name: str, part: Part, cold: bool = False) -> Start:
             process.wait(TIMEOUT_S)
     if not line.strip().isdigit():
         raise RfconstructError(f"a start of {part} failed", value=process.returncode, action="run " + " ".join(command))
-    return Start(seconds, int(line) / 1e6)
+    return Start(seconds, _children_cpu_s() - begin_cpu_s, int(line) / 1e6)
+
+
+def _children_cpu_s() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def resident_bytes() -> int:
