@@ -50,8 +50,8 @@ class HeatmapSettings:
 
     range_window: WindowName = "hann"
     angle_window: WindowName = "hann"
-    taylor_sidelobe_db: float = 35.0
-    taylor_nbar: int = 5
+    taylor_sidelobe_db: float = 30.0
+    taylor_nbar: int = 4
     angle_bins: int = 256
     focus: bool = True
     loops: int = 0
@@ -88,11 +88,11 @@ class CfarSettings:
         correlated: thresholds count the ring's effective number of independent cells, known from the heatmap's
             windows; false takes all cells as independent and lets more false alarms through than designed.
         guard_range, guard_angle: half widths of the guard box in bins; in angle it must cover the main lobe (defaults
-            for 86 elements with Hann taper on 256 bins), or a strong target counts as its own noise.
+            for 86 elements on 256 bins, Hann's lobe being the widest), or a strong target counts as its own noise.
         train_range, train_angle: half widths of the training box in bins; the ring between them is the neighbourhood.
         os_quantile: rank of the ordered statistic as a share of the ring's cells.
         sidelobe_guard: leave out detections that the windows' sidelobes of a stronger detection explain.
-        sidelobe_margin_db: how far above those sidelobes a detection must stand; several reflectors' sidelobes add up.
+        sidelobe_margin_db: how far above those sidelobes a detection must stand; 6 dB is what two equal ones add up to.
         min_range_m: cells nearer are not tested (transmit leakage).
         max_detections: strongest kept per radar and frame.
     """
@@ -106,7 +106,7 @@ class CfarSettings:
     train_angle: int = 14
     os_quantile: float = 0.75
     sidelobe_guard: bool = True
-    sidelobe_margin_db: float = 3.0
+    sidelobe_margin_db: float = 6.0
     min_range_m: float = 0.6
     max_detections: int = 512
 

@@ -25,7 +25,7 @@ def taper(settings: HeatmapSettings, axis: Literal["range", "angle"], count: int
     return window(name, count, centre, settings.taylor_nbar, settings.taylor_sidelobe_db)
 
 
-def window(name: WindowName, count: int, centre: float, nbar: int = 5, sidelobe_db: float = 35.0) -> Float64:
+def window(name: WindowName, count: int, centre: float, nbar: int = 4, sidelobe_db: float = 30.0) -> Float64:
     """Taper of ``count`` samples, symmetric about index ``centre``; the period of Hann and Taylor is ``count``.
 
     Args:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edge.config import AntennaSettings, HeatmapSettings
+from edge.config import AntennaSettings, HeatmapSettings, WindowName
 from edge.frames import Float64, RadarFrame
 from edge.reference.point_targets import Complex128, unpack
 
@@ -96,7 +96,7 @@ def _range_spectrum(radar: Radar, frame: RadarFrame, settings: HeatmapSettings, 
     """Windowed Fourier sums [loop, slots, receivers, points] of the calibrated samples."""
     samples = radar.schedule.layout.samples
     n = np.arange(samples)
-    window = np.ones(samples) if settings.range_window == "rectangular" else np.sin(np.pi * n / samples) ** 2
+    window = shape(settings.range_window, n / samples - 0.5, settings)
     shift = np.asarray(radar.calibration.range_shift_bins)[..., None]
     codes = unpack(frame.adc, frame.layout)[:loops]
     calibrated = codes * np.asarray(radar.calibration.gain)[..., None] * np.exp(-2j * np.pi * n * shift / samples)
@@ -106,7 +106,24 @@ def _range_spectrum(radar: Radar, frame: RadarFrame, settings: HeatmapSettings, 
 
 def taper(settings: HeatmapSettings, x: Float64) -> Float64:
     """Angle window at x, -1/2 .. +1/2 from edge to edge of the row."""
-    return np.cos(np.pi * x) ** 2 if settings.angle_window == "hann" else np.ones_like(x)
+    return shape(settings.angle_window, x, settings)
+
+
+def shape(name: WindowName, x: Float64, settings: HeatmapSettings) -> Float64:
+    """A window at x, -1/2 .. +1/2; Taylor's as 1 + 2 sum_m F_m cos(2 pi m x) over its value at 0 (Taylor 1955)."""
+    if name == "rectangular":
+        return np.ones_like(x)
+    if name == "hann":
+        return np.asarray(np.cos(np.pi * x) ** 2)
+    nbar, a = settings.taylor_nbar, np.arccosh(10.0 ** (settings.taylor_sidelobe_db / 20.0)) / np.pi
+    zero = [nbar**2 * (a**2 + (i - 0.5) ** 2) / (a**2 + (nbar - 0.5) ** 2) for i in range(1, nbar)]
+    values, centre = np.ones_like(x), 1.0
+    for m in range(1, nbar):
+        moved = np.prod([1.0 - m**2 / z for z in zero])
+        kept = np.prod([1.0 - m**2 / i**2 for i in range(1, nbar) if i != m])
+        f = (-1.0) ** (m + 1) * moved / (2.0 * kept)
+        values, centre = values + 2.0 * f * np.cos(2.0 * np.pi * m * x), centre + 2.0 * f
+    return np.asarray(values / centre)
 
 
 def _row_weights(position_m: Float64, settings: HeatmapSettings) -> Float64:
