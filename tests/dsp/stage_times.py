@@ -30,11 +30,6 @@ def main(count: int) -> None:
     adc, power, tables, rank = imager._packed(frame), heatmap.power, ca._tables, os_._tables
     stages = {
         "range": lambda: imager._run_range(adc, 1),
-        "row": lambda: imager._row_kernel(
-            *(imager._spectra, imager._block_slot, imager._block_element, imager._focus, imager._rows),
-            *(imager._phasor, imager._row_work, imager._row),
-        ),
-        "row + angle": lambda: imager._run_angle(imager._sectors[0][0]),
         "imager": lambda: imager.process(frame),
         "imager 1.5 m/s": lambda: imager.process(frame, np.array([0.0, 1.5, 0.0])),
         "imager 3 m/s": lambda: imager.process(frame, np.array([0.0, 3.0, 0.0])),
