@@ -10,6 +10,7 @@ from edge.bench.cases import NEAR_M, REFLECTORS
 from edge.bench.suite import COLD_S, KERNELS_MB, SPREAD, WARM_S
 
 Result = dict[str, Any]
+QUIET = 0.5
 SLACK = 1.05
 """Figures within 5 % of each other are not told apart."""
 
@@ -64,7 +65,12 @@ def _head(machine: dict[str, Any]) -> Iterator[str]:
         "Everything ran in one process with one thread, except where two cores are named; every call got the same "
         "time, in bursts of five, spread over the whole measurement. The goals are for a core of the Sapphire Rapids "
         f"class; on another machine the ratios count. The scene is simulated: {REFLECTORS} point reflectors; one with "
-        f"a point within {NEAR_M:g} m counts as found."
+        f"a point within {NEAR_M:g} m counts as found. Load of the machine when the run began: {machine['load']:.1f}"
+        + (
+            f"; above {QUIET:g} other processes lengthen what is measured by the wall clock."
+            if machine["load"] > QUIET
+            else "."
+        )
     )
     yield ""
 

@@ -35,6 +35,7 @@ def run_suite(rig: Rig, seconds: float, cold: bool) -> dict[str, Any]:
         machine, frames, stages, hand_off_us, ceilings, work, starts, not_measured.
     """
     errors: dict[str, str] = {}
+    about = machine(rig)
     with TwoCores() as cores:
         frames = whole_frames(rig, cores, errors)
         frame_times = _measured(frames, FRAME_SHARE * seconds)
@@ -46,7 +47,7 @@ def run_suite(rig: Rig, seconds: float, cold: bool) -> dict[str, Any]:
     start(rig.name, "pipeline")  # fills the cache, if it was not
     starts = [("kernels", False), ("pipeline", False), *([("pipeline", True)] if cold else [])]
     return {
-        "machine": machine(rig),
+        "machine": about,
         "frames": [_as_dict(case, frame_times) for case in frames],
         "stages": [_as_dict(case, part_times) for case in parts],
         "hand_off_us": 1e3 * hand_off.wall_ms,
@@ -72,6 +73,7 @@ def machine(rig: Rig) -> dict[str, Any]:
     return {
         "processor": processor(),
         "cores": os.cpu_count() or 1,
+        "load": os.getloadavg()[0],
         "python": platform.python_version(),
         **versions,
         "rig": rig.name,
