@@ -21,7 +21,7 @@ from typing import Literal
 
 from edge import numba_cache
 from edge.config import CompletionSettings, StreamSettings
-from edge.errors import ExitCode, RfconstructError
+from edge.errors import ConfigError, ExitCode, RfconstructError
 from edge.resources import data_dir
 from edge.rig import known_rigs, load_rig
 from edge.version import version
@@ -223,12 +223,16 @@ def kernels() -> Check:
     from edge.warm import warm_up
 
     start_s = time.monotonic()
-    names = known_rigs()
-    for name in names:
-        warm_up(load_rig(name))
-    folder = Path(os.environ[numba_cache.VARIABLE])
-    count = sum(1 for _ in folder.rglob("*.nbi"))
-    return Check("kernels", "ok", f"{count} ready for {len(names)} rigs after {time.monotonic() - start_s:.1f} s")
+    ready, without = [], []
+    for name in known_rigs():
+        try:
+            warm_up(load_rig(name))
+            ready.append(name)
+        except ConfigError as error:  # a rig for its schedule alone: nothing processes its samples
+            without.append(f"{name} ({error.value})")
+    count = sum(1 for _ in Path(os.environ[numba_cache.VARIABLE]).rglob("*.nbi"))
+    found = f"{count} cached, ready for {', '.join(ready)} after {time.monotonic() - start_s:.1f} s"
+    return Check("kernels", "ok", f"{found}; no processing for {', '.join(without)}" if without else found)
 
 
 def port() -> Check:

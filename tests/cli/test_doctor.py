@@ -17,6 +17,7 @@ from edge import numba_cache
 from edge.commands import doctor_command
 from edge.config import StreamSettings
 from edge.errors import ExitCode
+from edge.rig import Rig
 
 ENDPOINT = "tcp://127.0.0.1:{}"
 
@@ -58,9 +59,16 @@ def test_a_healthy_machine(own_cache: Path) -> None:
 
 def test_warm_loads_every_rig(monkeypatch: pytest.MonkeyPatch) -> None:
     warmed = []
-    monkeypatch.setattr("edge.warm.warm_up", lambda rig: warmed.append(rig.name))
+
+    def warm_up(rig: Rig) -> None:
+        warmed.append(rig.name)
+        if rig.name == "awr2944_pair":
+            rig.radars["horizontal"].schedule.layout  # noqa: B018  real samples have none
+
+    monkeypatch.setattr("edge.warm.warm_up", warm_up)
     checks = outcomes("--warm")
     assert checks["kernels"]["outcome"] == "ok"
+    assert checks["kernels"]["found"].endswith("; no processing for awr2944_pair (AWR2944)")
     assert warmed == list(doctor_command.known_rigs())
     assert "kernels" not in outcomes()
 
