@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,14 +19,11 @@ from edge.calibration import DUMMY_VALUE, Calibration, Waveform, refuse_dummy
 from edge.calibration_fit import repair_outliers
 from edge.errors import CalibrationError, DependencyError
 from edge.frames import Float64
-
-if TYPE_CHECKING:
-    from edge.waveform import Schedule
+from edge.waveform import SPEED_OF_LIGHT_M_S, Schedule
 
 INTERPOLATION = 5
 DEFAULT_SLOPE_HZ_PER_S = 78.986e12
 DEFAULT_SAMPLE_RATE_HZ = 8e6
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 
 
 def import_ti_calibration(mat_path: Path, schedule: Schedule) -> Calibration:

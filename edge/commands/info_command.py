@@ -87,6 +87,7 @@ def describe_model(folder: Path) -> dict[str, Any]:
         "files": {f.file: f"{f.precision}, {f.size / 1e6:.2f} MB, sha256 {f.sha256}" for f in manifest.files.values()},
         "default file": manifest.default_file,
         "classes": list(manifest.classes),
+        "input frame": manifest.input_frame,
         "rigs": list(manifest.rigs),
     }
 

@@ -49,7 +49,7 @@ def cloud_picture(path: Path, cloud: FusedCloud, horizontal: Float32, vertical: 
     layers = (
         _layer("Horizontal radar alone (no elevation: drawn at the radar's height)", HORIZONTAL, horizontal),
         _layer("Vertical radar alone (no azimuth: drawn straight ahead)", VERTICAL, vertical),
-        _layer("Both, associated by power", BOTH, both),
+        _layer("Both, associated", BOTH, both),
     )
     limits = _limits([layer.xyz_m for layer in layers])
     spans = [high - low for low, high in limits]

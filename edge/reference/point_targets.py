@@ -144,7 +144,7 @@ def make_frame(
         shift_bins: [slots, receivers] beat frequency offset of each channel in bins of a ``samples``-point FFT.
     Returns:
         The frame in the capture layout of ``radar.schedule``.
-    Source: simulator physics, equation of the beat signal; docs/architecture.md, sign and phase conventions.
+    Source: the beat signal of docs/architecture.md, sign and phase conventions.
     """
     layout = radar.schedule.layout
     points_m = np.asarray(scatterers_m, dtype=np.float64).reshape(-1, 3)
