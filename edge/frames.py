@@ -14,6 +14,7 @@ Times are nanoseconds of CLOCK_MONOTONIC unless a name says otherwise; the insta
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -219,6 +220,9 @@ class Heatmap:
         response: how a point target appears; None: unknown, detections are interpolated by plain parabolas.
         doppler: maps whose largest value ``power`` holds; None: Doppler was not kept.
         motion: what was steered with; None: the scene is shown as at the first chirp.
+        maps: number of maps of different speeds whose largest value ``power`` holds.
+        sweep_rad: phase, rms over the channels, by which a cell's noise changes from the first of these maps to the
+            last; infinite: their noise is independent.
     """
 
     radar: RadarId
@@ -230,6 +234,8 @@ class Heatmap:
     response: PointResponse | None = None
     doppler: DopplerMaps | None = None
     motion: BurstMotion | None = None
+    maps: int = 1
+    sweep_rad: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from edge.dsp.kernels_cfar import (
 )
 from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
 from edge.dsp.ring_tables import RingTables
+from edge.dsp.threshold import Maximum
 from edge.frames import Detections, Float32, Heatmap, PointResponse
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class Detector:
         self._bounds: tuple[Float32, ...] | None = None
         self._ends_m = (np.nan, np.nan)
         self._response: PointResponse | None = None
+        self._maximum: Maximum | None = None
         self._axes = np.zeros(8)
         self._margin = 10.0 ** (0.1 * settings.sidelobe_margin_db)
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
@@ -77,7 +79,7 @@ class Detector:
             ConfigError: the ring does not fit onto the angle axis.
         """
         self._prepare(heatmap)
-        self._look_up(heatmap.response)
+        self._look_up(heatmap)
         count = self._find(heatmap.power)
         kept = strongest(heatmap.power, self._cells, count, self.settings.max_detections, self._value, self._index)
         self.cut = count - kept
@@ -94,15 +96,15 @@ class Detector:
     def decisions(self, heatmap: Heatmap) -> NDArray[np.bool_]:
         """CFAR decision of every cell [angle, range] before the local-maximum test; for analysis, not for the road."""
         self._prepare(heatmap)
-        self._look_up(heatmap.response)
+        self._look_up(heatmap)
         decided = np.zeros(heatmap.power.shape, dtype=np.bool_)
         tables = self._tables
         if self.settings.kind == "os":
             kernel = rank_decisions_kernel(*self._ring)
-            kernel(heatmap.power, self._pattern, tables.first, tables.factor, tables.allowed, self._padded, decided)
+            kernel(heatmap.power, self._pattern, tables.first, self._factor, tables.allowed, self._padded, decided)
         else:
             self._estimate(heatmap.power)
-            mean_decisions(heatmap.power, self._pattern, self._noise, tables.factor, tables.first, decided)
+            mean_decisions(heatmap.power, self._pattern, self._noise, self._factor, tables.first, decided)
         return decided
 
     def noise(self, heatmap: Heatmap) -> Float32:
@@ -113,7 +115,7 @@ class Detector:
         """
         require(self.settings.kind != "os", "cfar.kind", self.settings.kind, "ca, go, so for a map of the noise")
         self._prepare(heatmap)
-        self._look_up(heatmap.response)
+        self._look_up(heatmap)
         self._estimate(heatmap.power)
         return self._noise
 
@@ -131,7 +133,7 @@ class Detector:
         train = self.settings.train_angle
         require(2 * train < angles, "cfar.train_angle", train, f"at most {(angles - 1) // 2} for {angles} angle bins")
         self._first = int(np.searchsorted(range_m, self.settings.min_range_m))
-        self._tables = RingTables.of(self.settings, ranges, self._first)
+        self._tables, self._maximum = RingTables.of(self.settings, ranges, self._first), None
         width = ranges + 2 * self.settings.train_range + self.settings.guard_range
         self._line = np.zeros((3, width), dtype=np.float32)
         self._full = np.zeros((angles + 2 * train, width), dtype=np.float32)
@@ -147,10 +149,17 @@ class Detector:
         self._axes[4:], self._bounds = 0.0, None
         self._shape, self._ends_m = (angles, ranges), ends_m
 
-    def _look_up(self, response: PointResponse | None) -> None:
-        """What a point looks like, taken over only when it is another one than the last heatmap's."""
-        if response is self._response:
-            return
+    def _look_up(self, heatmap: Heatmap) -> None:
+        """What points and noise look like, taken over only when it is something else than in the last heatmap."""
+        if heatmap.response is not self._response:
+            self._take_over(heatmap.response)
+        maximum = Maximum(heatmap.maps, heatmap.sweep_rad)
+        if maximum != self._maximum:
+            settings = self.settings
+            self._factor = maximum.factor(settings.kind, self._tables.factor, settings.p_fa, settings.os_quantile)
+            self._maximum = maximum
+
+    def _take_over(self, response: PointResponse | None) -> None:
         self._pattern[:] = 1.0
         self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, response
         self._axes[4:], self._bounds = 0.0, None
@@ -160,7 +169,7 @@ class Detector:
             self._axes[4:7] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
             self._axes[7] = response.range_spread_bins
             self._look_up_sidelobes(response)
-        self._tables = RingTables.of(self.settings, self._shape[1], self._first, response)
+        self._tables, self._maximum = RingTables.of(self.settings, self._shape[1], self._first, response), None
 
     def _look_up_sidelobes(self, response: PointResponse) -> None:
         """Bounds of a point's power by distance in bins; off without them."""
@@ -193,13 +202,13 @@ class Detector:
         tables = self._tables
         if self.settings.kind == "os":
             found = self._rank_peaks(
-                *(power, self._pattern, tables.first, tables.factor, tables.allowed, self._padded, self._mark),
+                *(power, self._pattern, tables.first, self._factor, tables.allowed, self._padded, self._mark),
                 *(self._scratch, self._scratch.view(np.int32), self._cells, self._estimates),
             )
         else:
             self._estimate(power)
             found = mean_peaks(
-                *(power, self._pattern, self._noise, tables.factor, tables.first, self._cells, self._estimates)
+                *(power, self._pattern, self._noise, self._factor, tables.first, self._cells, self._estimates)
             )
         return int(found)
 

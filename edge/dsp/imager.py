@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from edge.config import AntennaSettings, HeatmapSettings, require
 from edge.dsp import tables, tdm
+from edge.dsp.across import AcrossMotion
 from edge.dsp.antenna import along_loss_db
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
 from edge.dsp.doppler import DopplerFft
@@ -24,8 +24,8 @@ from edge.dsp.kernels_doppler import PADDING, channel_kernel
 from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
 from edge.dsp.row import RowGeometry
 from edge.dsp.steering import Steering
-from edge.errors import CaptureError, PoseError
-from edge.frames import Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
+from edge.errors import CaptureError
+from edge.frames import BurstMotion, Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
 
 if TYPE_CHECKING:
     from edge.rig import Radar
@@ -152,6 +152,10 @@ class Imager:
                 table[block, 0, : len(values)] = values.real
                 table[block, 1, : len(values)] = values.imag
         self._make_response(taper, angle_taper, weight)
+        self._across = AcrossMotion(
+            *(geometry, angle_taper, self._transmit_time_s, self._wavelength_m, self._motion_rad_s_m),
+            *(self._loop_time_s, (self.settings.angle_bins, self.points), self._gain),
+        )
 
     def _make_response(self, taper: Float64, angle_taper: Float64, weight: Float64) -> None:
         """What motion and the spherical wavefront do to a target's peak: weighted least squares over the row.
@@ -219,7 +223,7 @@ class Imager:
     def choice(self, velocity_rig_m_s: Float64 | None) -> tdm.Choice:
         """What becomes of a burst's loops at this velocity; none given counts as standing still."""
         most = self._most_loops
-        forward_m_s, along_m_s = self._motion(velocity_rig_m_s)
+        forward_m_s, along_m_s, across_m_s = tdm.motion_m_s(velocity_rig_m_s, self.radar.radar)
         known = velocity_rig_m_s is not None
         speed_m_s = tdm.radial_speed_in_fov_m_s(velocity_rig_m_s) if velocity_rig_m_s is not None else 0.0
         coherent = tdm.coherent_loops(speed_m_s, self._wavelength_m, self._loop_time_s, most)
@@ -228,16 +232,8 @@ class Imager:
             bin_m = float(self.range_m[1] - self.range_m[0]) * self.points / self.layout.samples
             in_bin = int(bin_m / (speed_m_s * self._loop_time_s))
             steerable = min(most, max(1, in_bin), self._steering.loops_that_fit(forward_m_s, along_m_s, most))
-        return tdm.choose(self.settings.doppler, most, coherent, steerable, speed_m_s if known else None)
-
-    def _motion(self, velocity: Float64 | None) -> tuple[float, float]:
-        """Speeds along boresight and along the array."""
-        if velocity is None:
-            return 0.0, 0.0
-        forward_m_s, along_m_s = float(velocity[0]), float(velocity[tdm.array_axis(self.radar.radar)])
-        if not math.isfinite(forward_m_s + along_m_s):
-            raise PoseError("velocity of the rig is no number", value=velocity.tolist(), allowed="finite m/s")
-        return forward_m_s, along_m_s
+        tried = len(self._across.speeds_m_s(across_m_s))
+        return tdm.choose(self.settings.doppler, most, coherent, steerable, speed_m_s if known else None, tried)
 
     @cached_property
     def _doppler(self) -> DopplerFft:
@@ -286,12 +282,23 @@ class Imager:
         )
         if choice.name == "fft":
             self._doppler.run(self._cube, self._power)
-            return replace(heatmap, doppler=self._doppler.maps)
+            return replace(heatmap, doppler=self._doppler.maps, maps=choice.loops)
         if slot_phasors is not None:
             np.divide(slot_phasors, choice.loops, out=self._phasor, casting="same_kind")
             self._run_angle(self._sector)
             return heatmap
-        return self._undo_motion(heatmap, choice, *self._motion(velocity_rig_m_s))
+        forward_m_s, along_m_s, across_m_s = tdm.motion_m_s(velocity_rig_m_s, self.radar.radar)
+        speeds_m_s = self._across.speeds_m_s(across_m_s)
+        motion = self._undo_motion(choice, forward_m_s, along_m_s, float(speeds_m_s[0]), True)
+        if len(speeds_m_s) == 1:
+            return replace(heatmap, motion=motion)
+        self._across.keep(0, self._power)
+        for k, speed_m_s in enumerate(speeds_m_s[1:].tolist(), 1):
+            self._undo_motion(choice, forward_m_s, along_m_s, speed_m_s, False)
+            self._across.keep(k, self._power)
+        self._across.settle(self._power)
+        sweep_rad = self._across.sweep_rad(len(speeds_m_s), choice.loops if choice.name == "steer" else 1)
+        return replace(heatmap, motion=motion, maps=len(speeds_m_s), sweep_rad=sweep_rad)
 
     def _run_range(self, adc: NDArray[np.int32], loops: int, blocks: int | None = None) -> int:
         """Fill ``_spectra`` from the raw words, summed over loops; returns the codes at the rails."""
@@ -316,22 +323,27 @@ class Imager:
             *(self._spectra, focus, self._rows, self._block_channel, self._row_work, loop, self._cube),
         )
 
-    def _undo_motion(self, heatmap: Heatmap, choice: tdm.Choice, forward_m_s: float, along_m_s: float) -> Heatmap:
-        """Fill ``_power`` with the motion undone: by one phase per slot while that is enough, else by steering."""
+    def _undo_motion(
+        self, choice: tdm.Choice, forward_m_s: float, along_m_s: float, extra_m_s: float, first: bool
+    ) -> BurstMotion | None:
+        """Fill ``_power`` with the motion undone: by one phase per slot while that is enough, else by steering.
+
+        Points come nearer by ``extra_m_s`` besides; ``first`` call for this frame, later ones differ in that only.
+        """
         slowest_m_s, fastest_m_s = tdm.closing_range_m_s(forward_m_s, along_m_s)
         summed = choice.name != "steer"
         if summed and self._motion_rad_s_m * 0.5 * (fastest_m_s - slowest_m_s) <= LARGEST_MOTION_ERROR_RAD:
-            closing_m_s = 0.5 * (slowest_m_s + fastest_m_s)
+            closing_m_s = 0.5 * (slowest_m_s + fastest_m_s) + extra_m_s
             set_phasors(self._phasor, -closing_m_s, self._transmit_time_s, self._wavelength_m, float(choice.loops))
             self._run_angle(self._sector)
-            return heatmap
-        if summed:
+            return None
+        if summed and first:
             self._order_channels(self._phasors, 0)
         loops = 1 if summed else choice.loops
-        motion = self._steering.run(self._cube, forward_m_s, along_m_s, loops, self._power)
+        motion = self._steering.run(self._cube, forward_m_s, along_m_s, loops, self._power, extra_m_s)
         if summed and choice.loops > 1:
             self._power *= np.float32(1.0 / choice.loops**2)
-        return replace(heatmap, motion=motion)
+        return motion
 
     def _run_angle(self, sector: tdm.Sector) -> None:
         """Fill the sector's rows of ``_power`` from ``_spectra`` and ``_phasor``."""

@@ -96,8 +96,18 @@ class Steering:
             return most
         return max(1, int(self._cells * self._unit_m / (drift_m_s * loop_s)))
 
-    def run(self, cube: Float32, forward_m_s: float, along_m_s: float, loops: int, power: Float32) -> BurstMotion:
+    def run(
+        self,
+        cube: Float32,
+        forward_m_s: float,
+        along_m_s: float,
+        loops: int,
+        power: Float32,
+        extra_m_s: float = 0.0,
+    ) -> BurstMotion:
         """Fill ``power`` [angle, range] from ``loops`` of ``cube`` [channel, loop, (re, im), range].
+
+        ``extra_m_s``: speed at which points in every direction come nearer besides.
 
         Returns:
             The motion, with the instant whose scene ``power`` shows.
@@ -108,7 +118,7 @@ class Steering:
         for sector in self.sectors(forward_m_s, loops):
             across = math.sqrt(1.0 - sector.centre**2)
             slope_m_s = along_m_s - forward_m_s * sector.centre / across
-            closing_m_s = forward_m_s * across + along_m_s * sector.centre
+            closing_m_s = forward_m_s * across + along_m_s * sector.centre + extra_m_s
             bend_m_s = -0.5 * forward_m_s / across**3
             closing_m_s += 0.5 * bend_m_s * sector.half_width**2
             self._run_sector(cube, sector, closing_m_s, slope_m_s, loops, power)

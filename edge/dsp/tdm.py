@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.config import DopplerChoice
+from edge.errors import PoseError
 from edge.frames import Complex64, Float64, RadarId
 
 COHERENT_SHARE = 0.4
@@ -22,6 +23,21 @@ FOV_COSINE = math.sqrt(0.5)
 def array_axis(radar: RadarId) -> int:
     """Index of the rig axis along the radar's own array: y for the horizontal, z for the vertical."""
     return 1 if radar == "horizontal" else 2
+
+
+def motion_m_s(velocity_rig_m_s: Float64 | None, radar: RadarId) -> tuple[float, float, float]:
+    """Speeds of the rig along boresight, along the radar's array and across both; none given: standing still.
+
+    Raises:
+        PoseError: the velocity is no number.
+    """
+    if velocity_rig_m_s is None:
+        return 0.0, 0.0, 0.0
+    axis = array_axis(radar)
+    forward_m_s, along_m_s, across_m_s = (float(velocity_rig_m_s[i]) for i in (0, axis, 3 - axis))
+    if not math.isfinite(forward_m_s + along_m_s + across_m_s):
+        raise PoseError("velocity of the rig is no number", value=velocity_rig_m_s.tolist(), allowed="finite m/s")
+    return forward_m_s, along_m_s, across_m_s
 
 
 def radial_speed_in_fov_m_s(velocity_rig_m_s: Float64) -> float:
@@ -75,7 +91,9 @@ class Choice:
     reason: str
 
 
-def choose(wish: DopplerChoice, most: int, coherent: int, steerable: int, speed_m_s: float | None) -> Choice:
+def choose(
+    wish: DopplerChoice, most: int, coherent: int, steerable: int, speed_m_s: float | None, tried: int = 1
+) -> Choice:
     """What becomes of the loops; coherent sums only where they cannot cancel.
 
     Args:
@@ -84,19 +102,24 @@ def choose(wish: DopplerChoice, most: int, coherent: int, steerable: int, speed_
         coherent: loops whose plain sum cannot cancel at this speed (``coherent_loops``).
         steerable: loops that odometry can steer: a point stays in its range bin, the moved row within the angle FFT.
         speed_m_s: largest radial speed of a static point; None: not known.
+        tried: radial speeds that motion across the array makes worth trying; 1: it does not matter.
     """
     at = "no velocity given, taken as standing still" if speed_m_s is None else f"at {speed_m_s:.2f} m/s"
+    also = f"; {tried} radial speeds tried, the motion across the array" if tried > 1 else ""
     if most == 1 or wish == "single":
-        return Choice("single", 1, "one loop in use" if most == 1 else "heatmap.doppler asks for one loop")
+        return Choice("single", 1, ("one loop in use" if most == 1 else "heatmap.doppler asks for one loop") + also)
     if wish == "fft":
         return Choice("fft", most, "heatmap.doppler asks for it")
     if wish == "sum" or coherent >= most:
-        return Choice("sum", coherent, f"{at}: {coherent} of {most} loops add up without cancelling")
+        return Choice("sum", coherent, f"{at}: {coherent} of {most} loops add up without cancelling{also}")
+    if wish == "auto" and tried > 1 and most >= LEAST_FFT_LOOPS:
+        return Choice("fft", most, f"{at}: motion across the array has {most} loops tell the radial speeds apart")
     if wish == "steer" or steerable > coherent:
-        return Choice("steer", steerable, f"{at}: {coherent} of {most} loops add up as they are, {steerable} steered")
+        reason = f"{at}: {coherent} of {most} loops add up as they are, {steerable} steered{also}"
+        return Choice("steer", steerable, reason)
     if most >= LEAST_FFT_LOOPS:
         return Choice("fft", most, f"{at}: too fast to steer more than {steerable} of {most} loops")
-    return Choice("sum", coherent, f"{at}: too fast to steer, {coherent} of {most} loops add up")
+    return Choice("sum", coherent, f"{at}: too fast to steer, {coherent} of {most} loops add up{also}")
 
 
 def speed_phasors(radial_speed_m_s: float, transmit_time_s: Float64, wavelength_m: float) -> Complex64:
