@@ -5,7 +5,7 @@ A rig that moves at v across the array sees a static point come nearer at v u, u
 which this radar does not measure. Too few loops tell speeds apart, but not so the row itself: a target's power is
 largest, and its lobes are lowest, in the map whose speed is its own. The speeds stand one step apart over the field of
 view. Taking the strongest map cell by cell would keep every target's lobes from the map that fits it least; therefore a
-cell which the lobes of stronger targets in its range bin explain is taken from their maps.
+cell which the lobes of stronger targets in its range bin explain is taken from their maps (kernels_across.py).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class AcrossMotion:
         self._shown, self._owner = np.zeros(shape[0], dtype=np.int8), np.zeros(shape[0], dtype=np.int8)
 
     def _responses(self, geometry: RowGeometry, taper: Float64, time_wavelengths: Float64, bins: int) -> Float32:
-        """Bounds of a point's power [speed difference, angle difference], half a step and one bin about each."""
+        """Bounds of a point's amplitude [speed difference, angle difference], half a step and one bin about each."""
         weight = geometry.channel_weight(taper / taper.sum())
         inside = geometry.element >= 0
         half_steps = np.arange(-4 * MOST_STEPS - 1, 4 * MOST_STEPS + 2)
@@ -82,7 +82,7 @@ class AcrossMotion:
         power = np.square(np.abs(np.fft.ifft(row, bins, axis=1) * bins))
         power = np.maximum(power, np.maximum(np.roll(power, 1, axis=1), np.roll(power, -1, axis=1)))
         power = np.maximum(power[1:-1:2], np.maximum(power[:-2:2], power[2::2]))
-        return np.tile(MARGIN * np.maximum(power, LOBE_FLOOR), 2).astype(np.float32)
+        return np.tile(np.sqrt(MARGIN * np.maximum(power, LOBE_FLOOR)), 2).astype(np.float32)
 
     def speeds_m_s(self, across_m_s: float) -> Float64:
         """Closing speeds to try, in steps to either side of 0; only 0 where the phase stays within the limit."""

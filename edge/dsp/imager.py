@@ -224,16 +224,17 @@ class Imager:
         """What becomes of a burst's loops at this velocity; none given counts as standing still."""
         most = self._most_loops
         forward_m_s, along_m_s, across_m_s = tdm.motion_m_s(velocity_rig_m_s, self.radar.radar)
-        known = velocity_rig_m_s is not None
-        speed_m_s = tdm.radial_speed_in_fov_m_s(velocity_rig_m_s) if velocity_rig_m_s is not None else 0.0
+        speed_m_s = 0.0 if velocity_rig_m_s is None else tdm.radial_speed_in_fov_m_s(velocity_rig_m_s)
         coherent = tdm.coherent_loops(speed_m_s, self._wavelength_m, self._loop_time_s, most)
         steerable = most
         if speed_m_s > 0.0 and coherent < most:
             bin_m = float(self.range_m[1] - self.range_m[0]) * self.points / self.layout.samples
             in_bin = int(bin_m / (speed_m_s * self._loop_time_s))
             steerable = min(most, max(1, in_bin), self._steering.loops_that_fit(forward_m_s, along_m_s, most))
-        tried = len(self._across.speeds_m_s(across_m_s))
-        return tdm.choose(self.settings.doppler, most, coherent, steerable, speed_m_s if known else None, tried)
+        tried, of_partner = (len(self._across.speeds_m_s(speed)) for speed in (across_m_s, along_m_s))
+        unfolded = len(self._channels.pairs) > 0 or 4.0 * speed_m_s * self._loop_time_s < self._wavelength_m
+        at_m_s, sideways = None if velocity_rig_m_s is None else speed_m_s, unfolded and max(tried, of_partner) > 1
+        return tdm.choose(self.settings.doppler, most, coherent, steerable, at_m_s, tried, sideways)
 
     @cached_property
     def _doppler(self) -> DopplerFft:

@@ -92,7 +92,13 @@ class Choice:
 
 
 def choose(
-    wish: DopplerChoice, most: int, coherent: int, steerable: int, speed_m_s: float | None, tried: int = 1
+    wish: DopplerChoice,
+    most: int,
+    coherent: int,
+    steerable: int,
+    speed_m_s: float | None,
+    tried: int = 1,
+    sideways: bool = False,
 ) -> Choice:
     """What becomes of the loops; coherent sums only where they cannot cancel.
 
@@ -103,6 +109,8 @@ def choose(
         steerable: loops that odometry can steer: a point stays in its range bin, the moved row within the angle FFT.
         speed_m_s: largest radial speed of a static point; None: not known.
         tried: radial speeds that motion across the array makes worth trying; 1: it does not matter.
+        sideways: such motion matters to this radar or to its partner across it: both measure radial speeds then, which
+            pairs their detections.
     """
     at = "no velocity given, taken as standing still" if speed_m_s is None else f"at {speed_m_s:.2f} m/s"
     also = f"; {tried} radial speeds tried, the motion across the array" if tried > 1 else ""
@@ -112,8 +120,8 @@ def choose(
         return Choice("fft", most, "heatmap.doppler asks for it")
     if wish == "sum" or coherent >= most:
         return Choice("sum", coherent, f"{at}: {coherent} of {most} loops add up without cancelling{also}")
-    if wish == "auto" and tried > 1 and most >= LEAST_FFT_LOOPS:
-        return Choice("fft", most, f"{at}: motion across the array has {most} loops tell the radial speeds apart")
+    if wish == "auto" and sideways and most >= LEAST_FFT_LOOPS:
+        return Choice("fft", most, f"{at}: sideways, {most} loops tell radial speeds apart that odometry cannot")
     if wish == "steer" or steerable > coherent:
         reason = f"{at}: {coherent} of {most} loops add up as they are, {steerable} steered{also}"
         return Choice("steer", steerable, reason)

@@ -20,6 +20,7 @@ from edge.reference.doppler import steered_power
 from edge.reference.point_targets import make_frame
 
 FLAT = AntennaSettings(along_loss_db=0.0)
+STEER = HeatmapSettings(doppler="steer")
 BIN = 1.0 / (256 * 0.51264)
 FORWARD, ALONG, BACKWARD, WALKING = (10.0, 0.0), (0.0, 10.0), (0.0, -10.0), (1.5, 0.0)
 
@@ -48,7 +49,7 @@ def sidelobe_db(power):
 
 @pytest.fixture(scope="module")
 def imager(radar):
-    return Imager(radar, HeatmapSettings(angle_window="rectangular", angle_bins=2048), FLAT)
+    return Imager(radar, HeatmapSettings(angle_window="rectangular", angle_bins=2048, doppler="steer"), FLAT)
 
 
 class TestSidelobes:
@@ -70,7 +71,7 @@ class TestSidelobes:
 
     @pytest.mark.parametrize("velocity", [(0.0, 1.5), (0.0, -1.5), (1.5, 0.0)])
     def test_hann_at_walking_speed(self, radar, velocity):
-        imager = Imager(radar, HeatmapSettings(), FLAT)
+        imager = Imager(radar, STEER, FLAT)
         for angle_deg in (-20.0, 10.0):
             still = sidelobe_db(seen(imager, radar, angle_deg, (0.0, 0.0)).power)
             assert sidelobe_db(seen(imager, radar, angle_deg, velocity).power) < still + 1.0
@@ -79,7 +80,7 @@ class TestSidelobes:
     def test_hann_with_eight_loops_at_ten_metres_a_second(self, velocity):
         """The moved loops fill each other's gaps; one loop alone has gaps of 0.73 wavelengths and cannot."""
         radar = cascade_radar(loops=8)
-        imager = Imager(radar, HeatmapSettings(), FLAT)
+        imager = Imager(radar, STEER, FLAT)
         for angle_deg in (-40.0, -20.0, 0.0, 10.0, 35.0):
             still = sidelobe_db(seen(imager, radar, angle_deg, (0.0, 0.0)).power)
             assert sidelobe_db(seen(imager, radar, angle_deg, velocity).power) < still + 1.0
@@ -89,7 +90,7 @@ class TestSidelobes:
 @pytest.mark.parametrize("angle_deg", [-40.0, 0.0, 20.0])
 def test_places_are_those_of_the_first_chirp(radar, velocity, angle_deg):
     """At 10 m/s a point moves by 4 cm, 0.7 range bins or 0.9 angle bins at 6 m, while eight loops last."""
-    imager, detector = Imager(radar, HeatmapSettings(), FLAT), Detector(radar, CfarSettings())
+    imager, detector = Imager(radar, STEER, FLAT), Detector(radar, CfarSettings())
     found = detector.process(seen(imager, radar, angle_deg, velocity))
     assert abs(found.range_m[0] - 6.0) < 1.5e-3
     assert abs(found.direction_cosine[0] - np.sin(np.radians(angle_deg))) < 0.1 * BIN
@@ -104,7 +105,7 @@ def test_steering_recovers_the_noise_of_all_loops(velocity):
     noise = make_frame(radar, [place(6.0, 0.0)], 0.0, 0, 0, noise_lsb=25.0, rng=rng)
     velocity_rig = np.array([*velocity, 0.0])
     levels = {}
-    for doppler in ("single", "auto"):
+    for doppler in ("single", "steer"):
         imager = Imager(radar, HeatmapSettings(doppler=doppler), FLAT)
         power = imager.process(noise, velocity_rig).power[40:216]
         levels[imager.last_report.choice] = 10 * np.log10(power.mean())
@@ -155,9 +156,9 @@ class TestChoice:
     def test_report_says_what_and_why(self):
         radar = cascade_radar(loops=8)
         imager = Imager(radar, HeatmapSettings(), FLAT)
-        seen(imager, radar, 0.0, (0.0, 2.0))
+        seen(imager, radar, 0.0, (2.0, 0.0))
         assert imager.last_report.choice == "steer"
-        assert imager.last_report.reason == "at 1.41 m/s: 1 of 8 loops add up as they are, 8 steered"
+        assert imager.last_report.reason == "at 2.00 m/s: 1 of 8 loops add up as they are, 8 steered"
         assert (
             imager.choice(None).reason
             == "no velocity given, taken as standing still: 8 of 8 loops add up without cancelling"
