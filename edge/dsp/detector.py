@@ -11,21 +11,19 @@ from numpy.typing import NDArray
 from edge.config import CfarSettings, require
 from edge.dsp.doppler import finish
 from edge.dsp.interpolation import PARABOLA
-from edge.dsp.kernels_cfar import (
-    mean_decisions,
-    mean_peaks,
-    rank_decisions_kernel,
-    rank_peaks_kernel,
-    ring_halves_kernel,
-    ring_mean_kernel,
-)
+from edge.dsp.kernels_cfar import SPARE_ROWS, mean_decisions, mean_peaks, ring_halves_kernel, ring_mean_kernel
 from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
+from edge.dsp.kernels_rank import rank_decisions_kernel, rank_noise_kernel, rank_peaks_kernel
 from edge.dsp.ring_tables import RingTables
 from edge.dsp.threshold import Maximum
 from edge.frames import Detections, Float32, Heatmap, PointResponse
 
 if TYPE_CHECKING:
     from edge.rig import Radar
+
+
+LINE_BYTES = 64
+"""Of the cache."""
 
 
 class Detector:
@@ -62,7 +60,7 @@ class Detector:
         self._places = np.zeros((4, settings.max_detections), dtype=np.int64)
         self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
         if settings.kind == "os":
-            self._rank_peaks = rank_peaks_kernel(*self._ring)
+            self._rank_peaks, self._rank_noise = rank_peaks_kernel(*self._ring), rank_noise_kernel(*self._ring)
         elif settings.kind == "ca":
             self._ring_noise = ring_mean_kernel(*self._ring)
         else:
@@ -84,6 +82,7 @@ class Detector:
         kept = strongest(heatmap.power, self._cells, count, self.settings.max_detections, self._value, self._index)
         self.cut = count - kept
         kept = self._keep_reflectors(heatmap, kept)
+        self._estimate_ranks(heatmap, kept)
         self._refine(heatmap, kept)
         columns = self._columns[:, :kept].copy()
         cells, ranges = self._cells[self._index[:kept]], heatmap.power.shape[1]
@@ -117,7 +116,8 @@ class Detector:
         self._prepare(heatmap)
         self._look_up(heatmap)
         self._estimate(heatmap.power)
-        return self._noise
+        angles, ranges = heatmap.power.shape
+        return self._noise[:angles, :ranges]
 
     def _prepare(self, heatmap: Heatmap) -> None:
         """Axes; buffers and tables are made again only when they change."""
@@ -135,15 +135,16 @@ class Detector:
         self._first = int(np.searchsorted(range_m, self.settings.min_range_m))
         self._tables, self._maximum = RingTables.of(self.settings, ranges, self._first), None
         width = ranges + 2 * self.settings.train_range + self.settings.guard_range
-        self._line = np.zeros((3, width), dtype=np.float32)
-        self._full = np.zeros((angles + 2 * train, width), dtype=np.float32)
-        self._side = np.zeros_like(self._full)
-        self._noise = np.zeros((angles, ranges), dtype=np.float32)
+        self._line = _plane(4, width)
+        self._full, self._side = (_plane(angles + 2 * train + SPARE_ROWS, width) for _ in range(2))
+        self._noise = _plane(angles + SPARE_ROWS, ranges)
         self._cells = np.zeros(angles * (ranges + 1) // 4 + 1, dtype=np.int64)
         self._estimates = np.zeros(len(self._cells), dtype=np.float32)
-        self._padded = np.full((angles, ranges + 2 * self.settings.train_range), -1.0, dtype=np.float32)
+        self._padded = _plane(angles + 2 * train, ranges + 2 * self.settings.train_range)
+        self._padded[:] = -1.0
         self._mark = np.zeros(ranges, dtype=np.float32)
         self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
+        self._bits = self._scratch.view(np.int32)
         self._pattern = np.ones(angles, dtype=np.float32)
         self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, None
         self._axes[4:], self._bounds = 0.0, None
@@ -198,12 +199,12 @@ class Detector:
         )
 
     def _find(self, power: Float32) -> int:
-        """Local maxima above the threshold into ``_cells`` and ``_estimates``."""
+        """Local maxima above the threshold into ``_cells``, means of their rings into ``_estimates``."""
         tables = self._tables
         if self.settings.kind == "os":
             found = self._rank_peaks(
                 *(power, self._pattern, tables.first, self._factor, tables.allowed, self._padded, self._mark),
-                *(self._scratch, self._scratch.view(np.int32), self._cells, self._estimates),
+                self._cells,
             )
         else:
             self._estimate(power)
@@ -212,8 +213,25 @@ class Detector:
             )
         return int(found)
 
+    def _estimate_ranks(self, heatmap: Heatmap, count: int) -> None:
+        """Ordered statistics around the first ``count`` of ``_index`` into ``_estimates``; means are there already."""
+        if self.settings.kind == "os":
+            self._rank_noise(
+                *(self._padded, heatmap.power.shape[1], self._tables.allowed, self._cells, self._index, count),
+                *(self._scratch, self._bits, self._estimates),
+            )
+
     def _refine(self, heatmap: Heatmap, count: int) -> None:
         refine(
             *(heatmap.power, self._pattern, self._cells, self._index, self._estimates, count),
             *(self._range_fit, self._angle_fit, self._axes, self._columns),
         )
+
+
+def _plane(rows: int, width: int) -> Float32:
+    """Zeros [rows, at least width]; every row begins on a cache line, so that vectors do not straddle two."""
+    count = LINE_BYTES // 4
+    pitch = -(-width // count) * count
+    flat = np.zeros(rows * pitch + count, dtype=np.float32)
+    begin = -(flat.ctypes.data // 4) % count
+    return flat[begin : begin + rows * pitch].reshape(rows, pitch)

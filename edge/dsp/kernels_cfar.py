@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CFAR kernels on power [angle, range], periodic in angle, cut at both ends of range.
+"""CFAR kernels by means of a ring on power [angle, range], periodic in angle, cut at both ends of range.
 
 Unsigned indices spare the inner loops Numba's wrap-around of negative ones, which would keep them from vectorising.
 The ring is a box of half widths ``train`` without the box of half widths ``guard``. Ranges below ``first`` belong to no
@@ -15,13 +15,19 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from numba import boolean, float32, int32, int64, njit, types, uint64
+from numba import boolean, float32, int64, njit, types, uint64
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 
 MATRIX = float32[:, ::1]
 MEAN_ARGUMENTS = (MATRIX, float32[::1], int64, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
+ROWS = 4
+"""Angle rows whose sums are made together."""
+SPARE_ROWS = ROWS - 1
+"""Rows that planes have beyond the angles, so that the last group of rows is a whole one."""
+BLOCK = 32
+"""Range cells of which one must exceed the threshold before any of them is looked at."""
 
 
 @njit(inline="always")
@@ -43,17 +49,35 @@ def _close(planes, angles, train_angle):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _sum_along_range(line, ranges, guard, train, full, side, row):  # type: ignore[no-untyped-def]
-    """Box and guardless sums along range of one loaded row."""
-    for r in range(ranges):
-        outer = float32(0)
-        for d in range(train - guard):
-            outer += line[0, r + d] + line[0, r + train + guard + 1 + d]
-        inner = float32(0)
-        for d in range(2 * guard + 1):
-            inner += line[0, r + train - guard + d]
-        side[row, r] = outer
-        full[row, r] = outer + inner
+def _sum_of_pairs(cells, pairs, x, width):  # type: ignore[no-untyped-def]
+    """Sum of ``width`` cells from ``x`` on; ``pairs[x]`` = cells[x] + cells[x + 1]."""
+    total = float32(0)
+    for d in range(width // 2):
+        total += pairs[x + 2 * d]
+    if width % 2 == 1:
+        total += cells[x + width - 1]
+    return total
+
+
+@njit(inline="always")
+def _sums_of_rows(plane, a, r, width):  # type: ignore[no-untyped-def]
+    """Sums over ``width`` rows of one column, from row a, a + 1, a + 2 and a + 3 on; what they share is added once."""
+    shared = float32(0)
+    if width < ROWS:
+        one, two, three, four = shared, shared, shared, shared
+        for d in range(width):
+            one += plane[a + d, r]
+            two += plane[a + 1 + d, r]
+            three += plane[a + 2 + d, r]
+            four += plane[a + 3 + d, r]
+        return one, two, three, four
+    for d in range(ROWS - 1, width):
+        shared += plane[a + d, r]
+    before = plane[a + 1, r] + plane[a + 2, r]
+    behind = plane[a + width, r] + plane[a + width + 1, r]
+    one, two = shared + (plane[a, r] + before), shared + (before + plane[a + width, r])
+    three, four = shared + (plane[a + 2, r] + behind), shared + (behind + plane[a + width + 2, r])
+    return one, two, three, four
 
 
 @cache
@@ -63,26 +87,40 @@ def ring_mean_kernel(guard_angle: int, train_angle: int, guard_range: int, train
     Args:
         guard_angle, train_angle, guard_range, train_range: half widths in cells.
     Returns:
-        kernel(power [A, R], first, inverse_count [R], line [R + 2 train_range] zeroed, full, side
-        [A + 2 train_angle, R], noise [A, R]): ``noise`` = mean of the ring's cells.
+        kernel(power [A, R], pattern [A], first, inverse_count [2, R], floor [2, R], line [4, R + 2 train_range or more]
+        zeroed, full, side [A + 2 train_angle + 3, as line], noise [A + 3, R or more]): ``noise`` = mean of the ring's
+        cells; its last 3 rows are work space.
     """
+    outside, behind = train_range - guard_range, train_range + guard_range + 1
+    apart, guarded = train_angle - guard_angle, 2 * guard_angle + 1
 
     @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
     def kernel(power, pattern, first, inverse_count, floor, line, full, side, noise):  # type: ignore[no-untyped-def]
         angles, ranges = power.shape
         for a in range(angles):
             _load(power, pattern, a, first, train_range, line)
-            _sum_along_range(line, ranges, guard_range, train_range, full, side, a + train_angle)
+            row = a + train_angle
+            for x in range(ranges + 2 * train_range - 1):
+                line[1, x] = line[0, x] + line[0, x + 1]
+            for x in range(ranges + behind):
+                line[2, x] = _sum_of_pairs(line[0], line[1], x, outside)
+            for r in range(ranges):
+                outer = line[2, r] + line[2, r + behind]
+                side[row, r] = outer
+                full[row, r] = outer + _sum_of_pairs(line[0], line[1], r + outside, 2 * guard_range + 1)
         _close(full, angles, train_angle)
         _close(side, angles, train_angle)
-        for a in range(angles):
+        for a in range(0, angles, ROWS):
+            one, two, three, four = noise[a], noise[a + 1], noise[a + 2], noise[a + 3]
             for r in range(ranges):
-                total = float32(0)
-                for d in range(train_angle - guard_angle):
-                    total += full[a + d, r] + full[a + train_angle + guard_angle + 1 + d, r]
-                for d in range(2 * guard_angle + 1):
-                    total += side[a + train_angle - guard_angle + d, r]
-                noise[a, r] = total * inverse_count[0, r]
+                near = _sums_of_rows(full, a, r, apart)
+                far = _sums_of_rows(full, a + apart + guarded, r, apart)
+                one[r], two[r] = near[0] + far[0], near[1] + far[1]
+                three[r], four[r] = near[2] + far[2], near[3] + far[3]
+            for r in range(ranges):
+                beside, share = _sums_of_rows(side, a + apart, r, guarded), inverse_count[0, r]
+                one[r], two[r] = (one[r] + beside[0]) * share, (two[r] + beside[1]) * share
+                three[r], four[r] = (three[r] + beside[2]) * share, (four[r] + beside[3]) * share
 
     return kernel
 
@@ -149,7 +187,7 @@ def mean_decisions(power, pattern, noise, factor, first, decided):  # type: igno
 
 
 @njit(inline="always")
-def _is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
+def is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
     """Largest received power of its 3 x 3 neighbourhood; of equal neighbours the first in raster order is the peak."""
     angles, ranges = power.shape
     centre = power[a, r] * pattern[a]
@@ -171,7 +209,7 @@ def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: 
     Args:
         power: [A, R], compensated for the antenna pattern.
         pattern: [A], received power = power * pattern.
-        noise: [A, R], as received.
+        noise: [A, R] or more, as received.
         factor: [R].
         first: first tested range cell.
         cells: int64 [A R / 4], receives flat indices a R + r.
@@ -180,161 +218,20 @@ def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: 
         Peaks found.
     """
     angles, ranges = power.shape
-    count, begin = 0, uint64(first)
-    for a in range(angles):
-        above, level = float32(0), pattern[a]
-        for d in range(ranges - first):
-            c = begin + uint64(d)
-            above += float32(1) if power[a, c] * level > factor[c] * noise[a, c] else float32(0)
-        if above > float32(0):
-            for r in range(first, ranges):
-                if power[a, r] * level > factor[r] * noise[a, r] and _is_peak(power, pattern, a, r):
-                    cells[count] = a * ranges + r
-                    estimate[count] = noise[a, r]
-                    count += 1
-    return count
-
-
-@njit(inline="always")
-def _pad(power, pattern, first, train, padded):  # type: ignore[no-untyped-def]
-    """Copy the tested ranges, as received, into ``padded`` [A, R + 2 train]; its other cells hold -1, count nowhere."""
-    angles, ranges = power.shape
-    begin = uint64(first)
-    for a in range(angles):
-        for d in range(ranges - first):
-            padded[a, begin + uint64(train + d)] = power[a, begin + uint64(d)] * pattern[a]
-
-
-@njit(inline="always")
-def _exceeds_rank(padded, a, r, guard_angle, train_angle, guard, train, factor, allowed):  # type: ignore[no-untyped-def]
-    """True when at most ``allowed`` ring cells x have factor x >= the cell's power, that is power > factor x_(k)."""
-    angles = padded.shape[0]
-    bound = padded[a, r + train]
-    begin, behind = uint64(r), uint64(r + train + guard + 1)
-    count = float32(0)
-    for da in range(-train_angle, train_angle + 1):
-        row = (a + da + angles) % angles
-        if abs(da) > guard_angle:
-            for d in range(2 * train + 1):
-                count += float32(1) if padded[row, begin + uint64(d)] * factor >= bound else float32(0)
-        else:
-            for d in range(train - guard):
-                count += float32(1) if padded[row, begin + uint64(d)] * factor >= bound else float32(0)
-                count += float32(1) if padded[row, behind + uint64(d)] * factor >= bound else float32(0)
-        if count > allowed:
-            return False
-    return True
-
-
-@njit(inline="always")
-def _select(bits, count, rank):  # type: ignore[no-untyped-def]
-    """Place of the ``rank``-th smallest (1 = least) of the first ``count`` values, which are given as bit patterns.
-
-    Floats that are not negative are ordered as their patterns read as integers, and -1 stands below all; a bisection
-    with vectorised counting finds the pattern without a branch per value.
-    """
-    low, high = int32(0), int32(0x7F800000)
-    while low < high:
-        middle = int32(low + ((high - low) >> 1))
-        below = float32(0)
-        for n in range(count):
-            below += float32(1) if bits[n] <= middle else float32(0)
-        if below >= rank:
-            high = middle
-        else:
-            low = int32(middle + 1)
-    n = 0
-    while bits[n] != low:
-        n += 1
-    return n
-
-
-@njit(inline="always")
-def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, allowed, scratch, bits):  # type: ignore[no-untyped-def]
-    """x_(k) of the ring around one cell."""
-    angles = padded.shape[0]
     count = 0
-    for da in range(-train_angle, train_angle + 1):
-        row = (a + da + angles) % angles
-        for d in range(2 * train + 1):
-            if abs(da) > guard_angle or abs(d - train) > guard:
-                scratch[count] = padded[row, r + d]
-                count += 1
-    return scratch[_select(bits, count, count - allowed)]
-
-
-@njit(inline="always")
-def _mark_peaks(power, pattern, a, mark):  # type: ignore[no-untyped-def]
-    """For every range cell of one row: 2 received more than all 8 neighbours, 1 as much as the largest, 0 less."""
-    angles, ranges = power.shape
-    above, below = (a + angles - 1) % angles, (a + 1) % angles
-    up, here, down = pattern[above], pattern[a], pattern[below]
-    for r in range(1, ranges - 1):
-        higher = max(max(power[above, r - 1], power[above, r]), power[above, r + 1]) * up
-        lower = max(max(power[below, r - 1], power[below, r]), power[below, r + 1]) * down
-        largest = max(max(higher, lower), max(power[a, r - 1], power[a, r + 1]) * here)
-        centre = power[a, r] * here
-        mark[r] = float32(2) if centre > largest else (float32(1) if centre == largest else float32(0))
-    mark[0], mark[ranges - 1] = float32(1), float32(1)
-
-
-@cache
-def rank_peaks_kernel(guard_angle: int, train_angle: int, guard_range: int, train_range: int) -> Callable[..., Any]:
-    """Compile the search for local maxima that the ordered-statistic test accepts; exact.
-
-    Args:
-        guard_angle, train_angle, guard_range, train_range: half widths in cells.
-    Returns:
-        kernel(power [A, R], pattern [A], first, factor float32 [R], allowed int64 [R] = N - k, padded [A, R + 2
-        train_range] of -1, mark float32 [R], scratch float32 [cells of the box], bits (scratch as int32), cells,
-        estimate) -> peaks found; as in ``mean_peaks``, but the noise is x_(k).
-    """
-    signature = int64(
-        *(float32[:, ::1], float32[::1], int64, float32[::1], int64[::1], float32[:, ::1], float32[::1]),
-        *(float32[::1], int32[::1], int64[::1], float32[::1]),
-    )
-
-    @njit(signature, **OPTIONS)
-    def kernel(power, pattern, first, factor, allowed, padded, mark, scratch, bits, cells, estimate):  # type: ignore[no-untyped-def]
-        angles, ranges = power.shape
-        count = 0
-        _pad(power, pattern, first, train_range, padded)
-        for a in range(angles):
-            _mark_peaks(power, pattern, a, mark)
-            for r in range(first, ranges):
-                if mark[r] == float32(0) or (mark[r] == float32(1) and not _is_peak(power, pattern, a, r)):
-                    continue
-                if _exceeds_rank(
-                    padded, a, r, guard_angle, train_angle, guard_range, train_range, factor[r], allowed[r]
-                ):
-                    cells[count] = a * ranges + r
-                    estimate[count] = _ordered_statistic(
-                        padded, a, r, guard_angle, train_angle, guard_range, train_range, allowed[r], scratch, bits
-                    )
-                    count += 1
-        return count
-
-    return kernel
-
-
-@cache
-def rank_decisions_kernel(guard_angle: int, train_angle: int, guard_range: int, train_range: int) -> Callable[..., Any]:
-    """Compile the ordered-statistic decision of every cell, before any local-maximum test; exact, slow.
-
-    Args:
-        guard_angle, train_angle, guard_range, train_range: half widths in cells.
-    Returns:
-        kernel(power [A, R], pattern [A], first, factor [R], allowed [R], padded, decided bool [A, R]).
-    """
-    signature = types.void(MATRIX, float32[::1], int64, float32[::1], int64[::1], MATRIX, boolean[:, ::1])
-
-    @njit(signature, **OPTIONS)
-    def kernel(power, pattern, first, factor, allowed, padded, decided):  # type: ignore[no-untyped-def]
-        _pad(power, pattern, first, train_range, padded)
-        for a in range(power.shape[0]):
-            for r in range(first, power.shape[1]):
-                decided[a, r] = _exceeds_rank(
-                    padded, a, r, guard_angle, train_angle, guard_range, train_range, factor[r], allowed[r]
-                )
-
-    return kernel
+    for a in range(angles):
+        level = pattern[a]
+        for start in range(first, ranges, BLOCK):
+            begin, above = uint64(start), float32(1)
+            if start + BLOCK <= ranges:
+                above = float32(0)
+                for d in range(BLOCK):
+                    c = begin + uint64(d)
+                    above += float32(1) if power[a, c] * level > factor[c] * noise[a, c] else float32(0)
+            if above > float32(0):
+                for r in range(start, min(start + BLOCK, ranges)):
+                    if power[a, r] * level > factor[r] * noise[a, r] and is_peak(power, pattern, a, r):
+                        cells[count] = a * ranges + r
+                        estimate[count] = noise[a, r]
+                        count += 1
+    return count

@@ -247,6 +247,20 @@ def test_greatest_and_smallest_choose_their_side_of_a_step():
         np.testing.assert_allclose(noise[:, [31, 32]], expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(0, 1, 0, 1), (0, 2, 1, 4), (1, 4, 0, 3), (1, 5, 2, 3), (2, 6, 1, 6)])
+@pytest.mark.parametrize("angles", [13, 14, 15, 16])
+def test_every_mean_is_that_of_brute_force(shape, angles):
+    """Rings narrower and wider than the group of rows that is summed together, numbers of rows that groups leave."""
+    guard_angle, train_angle, guard_range, train_range = shape
+    ring = {"guard_angle": guard_angle, "train_angle": train_angle, "guard_range": guard_range}
+    chosen = settings("ca", train_range=train_range, **ring)
+    power = np.random.default_rng(sum(shape)).standard_exponential((angles, 21)).astype(np.float32)
+    expected = [
+        [definition.statistic(power.astype(float), a, r, chosen, 0) for r in range(21)] for a in range(len(power))
+    ]
+    np.testing.assert_allclose(Detector(RADAR, chosen).noise(heatmap(power)), expected, rtol=2e-6)
+
+
 def test_a_peak_of_100_db_beside_does_not_touch_the_noise_estimate():
     power = np.random.default_rng(2).standard_exponential((256, 128)).astype(np.float32)
     strong = power.copy()

@@ -12,6 +12,7 @@ from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.dsp.kernels_detect import drop_sidelobes
+from edge.reference import cfar as definition
 from edge.reference.point_targets import make_frame
 
 FLAT = AntennaSettings(along_loss_db=0.0)
@@ -150,6 +151,25 @@ def test_a_lone_reflector_is_one_detection_down_to_the_rounding(window, range_m,
     assert (found.power_db > found.power_db[0] - 80.0).sum() == 1
     bare = Detector(radar, CfarSettings(kind="os", p_fa=1e-5, sidelobe_guard=False))
     assert len(bare.process(heatmap_)) == len(found) + detector.sidelobes
+
+
+@pytest.mark.parametrize("noise_lsb", [0.0, 25.0])
+def test_ordered_noise_of_what_is_left_is_that_of_the_definition(noise_lsb):
+    """Made only after the sidelobes are gone: it must be the statistic of each detection's own ring."""
+    radar, rng = cascade_radar(), np.random.default_rng(2)
+    points = [place(r, a) for r, a in zip(rng.uniform(1, 12, 12), rng.uniform(-60, 60, 12), strict=True)]
+    frame = make_frame(radar, points, rng.uniform(20, 300, 12), 0, 0, noise_lsb=noise_lsb, rng=rng)
+    map_ = Imager(radar, HeatmapSettings(), AntennaSettings()).process(frame)
+    detector = Detector(radar, CfarSettings(kind="os", p_fa=1e-5))
+    found = detector.process(map_)
+    received = map_.power.astype(float) / map_.response.gain[:, None].astype(float)
+    first = int(np.searchsorted(map_.range_m, detector.settings.min_range_m))
+    kept = detector._index[: len(found)]
+    places = [divmod(cell, map_.power.shape[1]) for cell in detector._cells[kept].tolist()]
+    expected = [definition.statistic(received, a, r, detector.settings, first) for a, r in places]
+    assert detector.sidelobes > 20
+    assert len(found) >= 10
+    np.testing.assert_allclose(detector._estimates[kept], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("apart_deg", "weaker_db"), [(3.0, 5.0), (3.5, 15.0), (4.0, 20.0), (6.0, 25.0), (10.0, 40.0)])

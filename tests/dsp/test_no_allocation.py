@@ -79,7 +79,8 @@ def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(road
     way, imager, detector, run = road
     kernels = [all_zero, dead_channels, imager._range_kernel, strongest, drop_sidelobes, refine]
     kernels += motion_kernels(way, imager)
-    kernels += [detector._rank_peaks] if detector.settings.kind == "os" else [detector._ring_noise, mean_peaks]
+    ranks = detector.settings.kind == "os"
+    kernels += [detector._rank_peaks, detector._rank_noise] if ranks else [detector._ring_noise, mean_peaks]
     _nrt_python.memsys_enable_stats()
     try:
         before = rtsys.get_allocation_stats()
