@@ -10,9 +10,12 @@ import pytest
 from dsp_radars import cascade_radar
 
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
+from edge.dsp.across import LOBE_FLOOR, MARGIN, PROMINENT, TARGETS, WEAKEST
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.dsp.tdm import FOV_COSINE
+from edge.reference.across import cells_of_range_bin, lobe_amplitudes
+from edge.reference.heatmap import antenna_gain, direction_cosines, range_angle_power
 from edge.reference.point_targets import make_frame
 
 FLAT = AntennaSettings(along_loss_db=0.0)
@@ -133,3 +136,26 @@ def test_targets_of_one_range_bin_are_each_taken_from_their_own_map():
     assert found.direction_cosine[:3][order] == pytest.approx([-0.3, 0.1, 0.5], abs=0.5 * BIN)
     assert found.power_db[:3][order] == pytest.approx(20.0 * np.log10([1e3, 700.0, 800.0]), abs=1.0)
     assert (found.power_db[3:] < found.power_db[0] - 15.0).all()
+
+
+@pytest.mark.parametrize(("which", "sign", "speed_m_s"), [("vertical", 1, 0.5), ("horizontal", -1, 1.0)])
+def test_cells_agree_with_the_definition(which, sign, speed_m_s):
+    """Maps are those of a single closing speed; lobes, owners and powers follow from sums over channels."""
+    rng, axis = np.random.default_rng(3), 1 if which == "vertical" else 2
+    radar, settings, antenna = cascade_radar(which, array_sign=sign), HeatmapSettings(), AntennaSettings()
+    velocity = np.zeros(3)
+    velocity[axis] = speed_m_s
+    points = np.c_[rng.uniform(2, 9, 25), rng.uniform(-3, 3, 25), rng.uniform(-3, 3, 25)]
+    frame = make_frame(radar, points, rng.uniform(50, 900, 25), 0, 0, velocity, noise_lsb=25.0, rng=rng)
+    imager = Imager(radar, settings, antenna)
+    power = imager.process(frame, velocity).power
+    speeds = imager._across.speeds_m_s(speed_m_s)
+    maps = np.array([range_angle_power(radar, frame, settings, antenna, 1, speed) for speed in speeds])
+    floor = np.sqrt(MARGIN * LOBE_FLOOR)
+    lobes = np.maximum(lobe_amplitudes(radar, settings, imager._across.step_m_s, len(speeds) - 1) * MARGIN**0.5, floor)
+    pattern = 1.0 / antenna_gain(antenna, direction_cosines(radar, settings))
+    limits = (floor, PROMINENT, WEAKEST, TARGETS)
+    expected = np.array([cells_of_range_bin(maps[..., r], pattern, lobes, *limits) for r in range(maps.shape[2])]).T
+    close = np.abs(power - expected) <= 1e-3 * expected + 1e-6 * expected.max(axis=0)
+    assert (expected < maps.max(axis=0)).mean() > 0.1
+    assert close.mean() > 0.998
