@@ -178,6 +178,7 @@ class Detector:
         if self.settings.sidelobe_guard and response.range_envelope is not None and response.angle_envelope is not None:
             envelopes = response.range_envelope, response.angle_envelope
             self._bounds = tuple(np.square(envelope).astype(np.float32) for envelope in envelopes)
+            self._largest = max(float(bound.max(where=bound < 1.0, initial=0.0)) for bound in self._bounds)
 
     def _keep_reflectors(self, heatmap: Heatmap, count: int) -> int:
         """Close the gaps that sidelobes leave in ``_index``; returns what is left of ``count`` peaks."""
@@ -186,7 +187,7 @@ class Detector:
             return count
         kept = drop_sidelobes(
             *(heatmap.power, self._pattern, self._cells, self._index, count, self._axes, self._margin),
-            *(*self._bounds, self._received, self._places),
+            *(self._largest, *self._bounds, self._received, self._places),
         )
         self.sidelobes = count - int(kept)
         return int(kept)

@@ -60,11 +60,11 @@ def strongest(power, cells, count, most, value, index):  # type: ignore[no-untyp
 
 
 @njit(inline="always")
-def _is_explained(value, place, count, n, margin, most, range_bound, angle_bound):  # type: ignore[no-untyped-def]
+def _is_explained(value, place, count, n, margin, largest, range_bound, angle_bound):  # type: ignore[no-untyped-def]
     """Whether the sidelobes of one of ``count`` peaks bound peak n from above, see ``drop_sidelobes``."""
     a, r = place[0, n], place[1, n]
     for m in range(count):
-        if value[n] >= value[m] * most:
+        if value[n] >= value[m] * (largest * margin):
             continue
         away = max(abs(r - place[1, m]) - place[3, m], 0)
         range_share, angle_share = range_bound[away], angle_bound[place[2, m], abs(a - place[0, m])]
@@ -83,12 +83,12 @@ def _defocus_level(range_m, cosine, focus_inverse_m, levels):  # type: ignore[no
     return min(int64(np.ceil(left / DEFOCUS_STEP_PER_M)), levels - 1)
 
 
-SIDELOBE_ARGUMENTS = (float32[:, ::1], float32[::1], int64[::1], int64[::1], int64, float64[::1], float32)
+SIDELOBE_ARGUMENTS = (float32[:, ::1], float32[::1], int64[::1], int64[::1], int64, float64[::1], float32, float32)
 
 
 @njit(int64(*SIDELOBE_ARGUMENTS, float32[::1], float32[:, ::1], float32[::1], int64[:, ::1]), **OPTIONS)
 def drop_sidelobes(  # type: ignore[no-untyped-def]
-    power, pattern, cells, index, count, axes, margin, range_bound, angle_bound, value, place
+    power, pattern, cells, index, count, axes, margin, largest, range_bound, angle_bound, value, place
 ):
     """Leave out peaks that the windows' sidelobes of another peak explain.
 
@@ -102,6 +102,7 @@ def drop_sidelobes(  # type: ignore[no-untyped-def]
         count: peaks.
         axes: as in ``refine``.
         margin: power ratio.
+        largest: the largest bound of either axis that is not 1; none of a peak's sidelobes is stronger.
         range_bound, angle_bound: float32 [R], [level, A], bound of a point's power by distance in bins, 1 in the main
             lobe; the levels are those of the curvature that focusing leaves (edge/dsp/tables.py).
         value: float32 [count or more], work space for the received powers.
@@ -110,12 +111,6 @@ def drop_sidelobes(  # type: ignore[no-untyped-def]
         Peaks kept.
     """
     ranges = power.shape[1]
-    most = float32(0)
-    for share in range_bound:
-        most = max(most, share * margin if share < float32(1) else float32(0))
-    for level in angle_bound:
-        for share in level:
-            most = max(most, share * margin if share < float32(1) else float32(0))
     for n in range(count):
         a, r = cells[index[n]] // ranges, cells[index[n]] % ranges
         place[0, n], place[1, n] = a, r
@@ -124,7 +119,7 @@ def drop_sidelobes(  # type: ignore[no-untyped-def]
         place[3, n] = int64(np.ceil(axes[7] * min(abs(cosine), 1.0)))
     kept = 0
     for n in range(count):
-        if not _is_explained(value, place, count, n, margin, most, range_bound, angle_bound):
+        if not _is_explained(value, place, count, n, margin, largest, range_bound, angle_bound):
             index[kept] = index[n]
             kept += 1
     return kept

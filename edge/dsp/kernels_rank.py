@@ -85,12 +85,17 @@ def _select(bits, count, rank):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, allowed, scratch, bits):  # type: ignore[no-untyped-def]
     """x_(k) of the ring around one cell."""
-    count = 0
-    for da in range(-train_angle, train_angle + 1):
-        for d in range(2 * train + 1):
-            if abs(da) > guard_angle or abs(d - train) > guard:
-                scratch[count] = padded[a + train_angle + da, r + d]
-                count += 1
+    count, side = 0, train - guard
+    for t in range(2 * train_angle + 1):
+        if abs(t - train_angle) > guard_angle:
+            for d in range(2 * train + 1):
+                scratch[count + d] = padded[a + t, r + d]
+            count += 2 * train + 1
+        else:
+            for d in range(side):
+                scratch[count + d] = padded[a + t, r + d]
+                scratch[count + side + d] = padded[a + t, r + train + guard + 1 + d]
+            count += 2 * side
     return scratch[_select(bits, count, count - allowed)]
 
 

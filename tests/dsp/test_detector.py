@@ -209,7 +209,7 @@ def test_sidelobes_are_left_out_as_the_definition_says():
         if power[a, r] * pattern[a] >= strongest_share:
             kept.append(n)
     count = drop_sidelobes(
-        *(power, pattern, cells, index, 200, axes, np.float32(2.0), range_bound, angle_bound),
+        *(power, pattern, cells, index, 200, axes, np.float32(2.0), np.float32(0.1), range_bound, angle_bound),
         *(np.zeros(200, dtype=np.float32), np.zeros((4, 200), dtype=np.int64)),
     )
     assert 20 < count < 180
