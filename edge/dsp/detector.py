@@ -13,7 +13,7 @@ from edge.dsp.doppler import finish
 from edge.dsp.interpolation import PARABOLA
 from edge.dsp.kernels_cfar import SPARE_ROWS, mean_decisions, mean_peaks, ring_halves_kernel, ring_mean_kernel
 from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
-from edge.dsp.kernels_rank import rank_decisions_kernel, rank_noise_kernel, rank_peaks_kernel
+from edge.dsp.kernels_rank import SELECTED, rank_decisions_kernel, rank_noise_kernel, rank_peaks_kernel
 from edge.dsp.ring_tables import RingTables
 from edge.dsp.threshold import Maximum
 from edge.frames import Detections, Float32, Heatmap, PointResponse
@@ -143,7 +143,8 @@ class Detector:
         self._padded = _plane(angles + 2 * train, ranges + 2 * self.settings.train_range)
         self._padded[:] = -1.0
         self._mark = np.zeros(ranges, dtype=np.float32)
-        self._scratch = np.zeros((2 * train + 1) * (2 * self.settings.train_range + 1), dtype=np.float32)
+        box = (2 * train + 1) * (2 * self.settings.train_range + 1)
+        self._scratch = np.zeros(box + SELECTED, dtype=np.float32)
         self._bits = self._scratch.view(np.int32)
         self._pattern = np.ones(angles, dtype=np.float32)
         self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, None

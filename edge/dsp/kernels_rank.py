@@ -11,9 +11,15 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 from numba import boolean, float32, int32, int64, njit, types, uint64
 
 from edge.dsp.kernels_cfar import MATRIX, OPTIONS, is_peak
+
+INFINITE = np.int32(0x7F800000)
+"""Bits of the float32 infinity."""
+SELECTED = 64
+"""Values are ranked in whole groups of so many, for which vectors have no remainder; infinities fill the last one."""
 
 
 @njit(inline="always")
@@ -66,7 +72,7 @@ def _select(bits, count, rank):  # type: ignore[no-untyped-def]
     Floats that are not negative are ordered as their patterns read as integers, and -1 stands below all; a bisection
     with vectorised counting finds the pattern without a branch per value.
     """
-    low, high = int32(0), int32(0x7F800000)
+    low, high = int32(0), INFINITE
     while low < high:
         middle = int32(low + ((high - low) >> 1))
         below = float32(0)
@@ -96,7 +102,10 @@ def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, all
                 scratch[count + d] = padded[a + t, r + d]
                 scratch[count + side + d] = padded[a + t, r + train + guard + 1 + d]
             count += 2 * side
-    return scratch[_select(bits, count, count - allowed)]
+    whole = -(-count // SELECTED) * SELECTED
+    for n in range(count, whole):
+        bits[n] = INFINITE
+    return scratch[_select(bits, whole, count - allowed)]
 
 
 @njit(inline="always")
@@ -154,8 +163,8 @@ def rank_noise_kernel(guard_angle: int, train_angle: int, guard_range: int, trai
         guard_angle, train_angle, guard_range, train_range: half widths in cells.
     Returns:
         kernel(padded as ``rank_peaks_kernel``'s left it, ranges R, allowed [R], cells, index int64, count, scratch
-        float32 [cells of the box], bits (scratch as int32), estimate): estimate[i] = x_(k) around cells[i] for the
-        first ``count`` i of ``index``.
+        float32 [cells of the box, and up to a multiple of 64], bits (scratch as int32), estimate): estimate[i] = x_(k)
+        around cells[i] for the first ``count`` i of ``index``.
     """
     signature = types.void(MATRIX, int64, *3 * (int64[::1],), int64, float32[::1], int32[::1], float32[::1])
 
