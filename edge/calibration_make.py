@@ -148,11 +148,8 @@ def make_calibration(
         turn_deg=None if np.isnan(turn_rad) else float(np.degrees(turn_rad)),
         repaired=repaired,
     )
-    calibration = Calibration(
-        *(_scaled(gain, amplitude), shift, reflector.range_m, board, temperature_c, date.today().isoformat()),
-        made_with=Waveform.of(schedule),
-        repaired=repaired,
-    )
+    facts = (reflector.range_m, board, temperature_c, date.today().isoformat(), Waveform.of(schedule), repaired)
+    calibration = Calibration(_scaled(gain, amplitude), shift, *facts)
     return MadeCalibration(calibration, quality, profile, peak, level_db, residual)
 
 
