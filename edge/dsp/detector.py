@@ -142,7 +142,7 @@ class Detector:
         self._estimates = np.zeros(len(self._cells), dtype=np.float32)
         self._padded = _plane(angles + 2 * train, ranges + 2 * self.settings.train_range)
         self._padded[:] = -1.0
-        self._mark = np.zeros(ranges, dtype=np.float32)
+        self._mark, self._row = np.zeros(ranges, dtype=np.float32), np.zeros(ranges, dtype=np.int64)
         box = (2 * train + 1) * (2 * self.settings.train_range + 1)
         self._scratch = np.zeros(box + SELECTED, dtype=np.float32)
         self._bits = self._scratch.view(np.int32)
@@ -206,7 +206,7 @@ class Detector:
         if self.settings.kind == "os":
             found = self._rank_peaks(
                 *(power, self._pattern, tables.first, self._factor, tables.allowed, self._padded, self._mark),
-                self._cells,
+                *(self._row, self._cells),
             )
         else:
             self._estimate(power)

@@ -131,19 +131,27 @@ def rank_peaks_kernel(guard_angle: int, train_angle: int, guard_range: int, trai
         guard_angle, train_angle, guard_range, train_range: half widths in cells.
     Returns:
         kernel(power [A, R], pattern [A], first, factor float32 [R], allowed int64 [R] = N - k, padded
-        [A + 2 train_angle, R + 2 train_range or more] of -1, mark float32 [R], cells) -> peaks found; cells as in
-        ``mean_peaks``.
+        [A + 2 train_angle, R + 2 train_range or more] of -1, mark float32 [R], places int64 [R], cells) -> peaks
+        found; cells as in ``mean_peaks``.
     """
 
-    @njit(int64(MATRIX, float32[::1], int64, float32[::1], int64[::1], MATRIX, float32[::1], int64[::1]), **OPTIONS)
-    def kernel(power, pattern, first, factor, allowed, padded, mark, cells):  # type: ignore[no-untyped-def]
+    @njit(
+        int64(MATRIX, float32[::1], int64, float32[::1], int64[::1], MATRIX, float32[::1], int64[::1], int64[::1]),
+        **OPTIONS,
+    )
+    def kernel(power, pattern, first, factor, allowed, padded, mark, places, cells):  # type: ignore[no-untyped-def]
         angles, ranges = power.shape
         count = 0
         _pad(power, pattern, first, train_angle, train_range, padded)
         for a in range(angles):
             _mark_peaks(power, pattern, a, mark)
+            marked = 0  # Places first, without a branch: which cells are maxima cannot be predicted.
             for r in range(first, ranges):
-                if mark[r] == float32(0) or (mark[r] == float32(1) and not is_peak(power, pattern, a, r)):
+                places[marked] = r
+                marked += int64(mark[r] > float32(0))
+            for n in range(marked):
+                r = places[n]
+                if mark[r] == float32(1) and not is_peak(power, pattern, a, r):
                     continue
                 if _exceeds_rank(
                     padded, a, r, guard_angle, train_angle, guard_range, train_range, factor[r], allowed[r]

@@ -41,7 +41,7 @@ def main(count: int) -> None:
         "detector GO": lambda: go.process(heatmap),
         "peaks OS": lambda: os_._rank_peaks(
             *(power, os_._pattern, rank.first, rank.factor, rank.allowed, os_._padded, os_._mark),
-            os_._cells,
+            *(os_._row, os_._cells),
         ),
         "detector OS": lambda: os_.process(heatmap),
         "imager + CA": lambda: ca.process(imager.process(frame)),
