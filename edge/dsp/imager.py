@@ -26,11 +26,11 @@ from edge.dsp.row import RowGeometry
 from edge.dsp.steering import Steering
 from edge.errors import CaptureError
 from edge.frames import BurstMotion, Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
+from edge.waveform import SPEED_OF_LIGHT_M_S
 
 if TYPE_CHECKING:
     from edge.rig import Radar
 
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 SHORTEST_RANGE_M = 0.05
 ANGLE_LANES = 32
 LARGEST_MOTION_ERROR_RAD = 0.01

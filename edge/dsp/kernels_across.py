@@ -128,8 +128,7 @@ def give_to_owners(  # type: ignore[no-untyped-def]
         for a in range(angles):
             if line[0, a] > line[1, a] * line[1, a]:
                 continue
-            near = line[2, a] > beside
-            least = float32(1e30)
+            near, least = line[2, a] > beside, float32(1e30)
             for t in range(owner[a] if near else 0, owner[a] + 1 if near else count):
                 m = centre[t]
                 value = share[t, 0] * maps[m - 1, a, r] + share[t, 1] * maps[m, a, r] + share[t, 2] * maps[m + 1, a, r]
