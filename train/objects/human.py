@@ -19,6 +19,8 @@ from train.objects.sampling import Int32
 
 _WORLD = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]) / 10
 """The file has decimetres, x left, y up, z forward; here metres, x forward, y left, z up."""
+HUMAN_ORIGIN = ("makehuman", "CC0-1.0", "MakeHuman community (not required)")
+"""Source group, licence and attribution of every person made here."""
 _CLOTHED = {"thigh": "leg", "calf": "leg", "pelvis": "leg", "spine": "torso", "clavicle": "torso", "upperarm": "torso",
             "lowerarm": "torso"}  # fmt: skip
 
@@ -127,7 +129,7 @@ class HumanModel:
             vertices = vertices * (float(np.clip(stature, 1.5, 1.98)) / np.ptp(body[used][:, 2]))
         return Mesh(
             stand(vertices.astype(np.float32)), faces, CLASSES.index("pedestrian"), f"pedestrian/human_{seed:05d}",
-            "makehuman", "own", "CC0-1.0", "MakeHuman community (not required)",
+            HUMAN_ORIGIN[0], "own", *HUMAN_ORIGIN[1:],
         )  # fmt: skip
 
     def _turns(self, heads: Float64, phase: float, amplitude: float, rng: np.random.Generator) -> dict[str, Float64]:
