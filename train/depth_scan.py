@@ -46,14 +46,21 @@ def rasterize(
     rows, columns = depth.shape
     depth[:] = np.inf
     hit[:] = -1
+    picture = np.empty((len(camera), 3), np.float64)
+    for i in range(len(camera)):
+        z = camera[i, 2]
+        if z > 0:
+            picture[i, 0] = focal * camera[i, 0] / z + center_u
+            picture[i, 1] = focal * camera[i, 1] / z + center_v
+        picture[i, 2] = 1.0 / z if z > 0 else 0.0
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        az, bz, cz = camera[a, 2], camera[b, 2], camera[c, 2]
-        if az <= 0 or bz <= 0 or cz <= 0:
+        ia, ib, ic = picture[a, 2], picture[b, 2], picture[c, 2]
+        if ia == 0 or ib == 0 or ic == 0:
             continue
-        au, av = focal * camera[a, 0] / az + center_u, focal * camera[a, 1] / az + center_v
-        bu, bv = focal * camera[b, 0] / bz + center_u, focal * camera[b, 1] / bz + center_v
-        cu, cv = focal * camera[c, 0] / cz + center_u, focal * camera[c, 1] / cz + center_v
+        au, av, bu, bv, cu, cv = (
+            picture[a, 0], picture[a, 1], picture[b, 0], picture[b, 1], picture[c, 0], picture[c, 1]
+        )  # fmt: skip
         area = (bu - au) * (cv - av) - (bv - av) * (cu - au)
         if area == 0:
             continue
@@ -61,8 +68,9 @@ def rasterize(
         last_u = min(columns - 1, int(np.floor(max(au, bu, cu))))
         first_v = max(0, int(np.ceil(min(av, bv, cv))))
         last_v = min(rows - 1, int(np.floor(max(av, bv, cv))))
+        if first_u > last_u or first_v > last_v:
+            continue
         scale = 1.0 / area
-        ia, ib, ic = 1.0 / az, 1.0 / bz, 1.0 / cz
         for v in range(first_v, last_v + 1):
             for u in range(first_u, last_u + 1):
                 wa = ((bu - u) * (cv - v) - (bv - v) * (cu - u)) * scale

@@ -8,108 +8,25 @@ marked "ours" below is an addition and has its own switch; ``PerturbSettings.pap
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from edge.config import require
 from edge.frames import Float32, Float64
 from train.depth_scan import Hits, scan
 from train.objects.mesh import Mesh
+from train.perturb_settings import PerturbSettings
 
-Range = tuple[float, float]
+__all__ = [
+    "PerturbSettings", "View", "add_artefacts", "base_sample", "cut_holes", "draw_view", "noise_spheres", "perturb",
+    "snapshot", "specular_weights",
+]  # fmt: skip
+
 AZIMUTH_SECTORS = 8
 _CANDIDATES = 8000
 _REPEATED_SIGMA_M = 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class PerturbSettings:
-    """Settings of every step; a pair is the range of a uniform draw, a probability is that the step happens at all.
-
-    Args:
-        distance_m: camera to the nearer end of the object, log-uniform; half the object's length is added.
-        height_m: camera above ground. aim_deg: largest error of the aim, in azimuth and elevation.
-        columns, rows: size of the depth map, fitted to the object.
-        path_probability, path_views, path_m: several snapshots merged along a straight path past the object (ours).
-        base_points: points drawn from the snapshot.
-        specular_probability: draw them in dense clusters about points that face the radar (ours; measured on clouds of
-            the real pipeline: 16..53 % of the visible surface has a point within 15 cm). specular_spots: number of
-            clusters; specular_radius_m: their sigma; specular_background: share of the weight that is not clustered.
-        pass_probability, pass_share: only this share of the object's width was passed (ours).
-        holes, hole_count, hole_radius_share: spheres cut out; radius as a share of the object's 3-D diagonal.
-        hole_min_keep: a hole that would leave less than this share of the points is skipped.
-        noise, noise_copies, noise_radius_m: each point becomes several on a sphere about it of radius R0 U(0, 1).
-        noise_by_distance: R0 = (0.02 R + 0.03 m) U(0.5, 1.5), kept inside noise_radius_m (ours); else R0 is uniform.
-        ellipsoid_probability: the sphere becomes an ellipsoid of half a range bin (3 cm) along the ray (ours).
-        noise_first: order of the paper; False cuts the holes first, so that their rims get fuzzy (ours).
-        extra_probability: for each of drift, outliers, ghosts and streaks (ours). drift_sigma: metres a metre of path.
-            outlier_share, ghost_share, streak_share: points added, as a share; streak_deg: along the iso-range arc.
-        clip_z_m: points outside are dropped.
-        sparse_probability, sparse_points: thin to a very sparse cloud (ours), log-uniform.
-        thin: thin the other clouds to a log-uniform number between sparse_points[1] and max_points (ours).
-        max_points: never more; fewer are never filled up.
-    """
-
-    distance_m: Range = (3.0, 12.0)
-    height_m: Range = (0.4, 1.2)
-    aim_deg: float = 3.0
-    columns: int = 160
-    rows: int = 120
-    path_probability: float = 0.5
-    path_views: tuple[int, int] = (2, 4)
-    path_m: float = 3.0
-    base_points: tuple[int, int] = (400, 1500)
-    specular_probability: float = 0.6
-    specular_spots: tuple[int, int] = (3, 14)
-    specular_radius_m: Range = (0.03, 0.25)
-    specular_background: Range = (0.01, 0.05)
-    pass_probability: float = 0.2
-    pass_share: Range = (0.4, 0.9)
-    holes: bool = True
-    hole_count: tuple[int, int] = (2, 6)
-    hole_radius_share: Range = (0.08, 0.25)
-    hole_min_keep: float = 0.25
-    noise: bool = True
-    noise_copies: tuple[int, int] = (2, 6)
-    noise_radius_m: Range = (0.05, 0.30)
-    noise_by_distance: bool = True
-    ellipsoid_probability: float = 0.3
-    noise_first: bool = False
-    extra_probability: float = 0.25
-    drift_sigma: float = 0.03
-    outlier_share: float = 0.03
-    ghost_share: float = 0.05
-    streak_share: float = 0.05
-    streak_deg: Range = (2.0, 6.0)
-    clip_z_m: Range = (0.0, 3.0)
-    sparse_probability: float = 0.25
-    sparse_points: tuple[int, int] = (64, 300)
-    thin: bool = True
-    max_points: int = 2048
-
-    def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self)):
-            value = getattr(self, name)
-            if isinstance(value, tuple):
-                require(value[0] <= value[1], f"perturb.{name}", value, "lowest <= highest")
-            elif name.endswith(("_probability", "_share", "_keep")):
-                require(0 <= value <= 1, f"perturb.{name}", value, "0..1")
-        require(self.distance_m[0] > 0, "perturb.distance_m", self.distance_m, "> 0 m")
-        for name in ("path_views", "base_points", "specular_spots", "noise_copies", "sparse_points"):
-            require(getattr(self, name)[0] >= 1, f"perturb.{name}", getattr(self, name), ">= 1")
-        for name in ("max_points", "columns", "rows"):
-            require(getattr(self, name) >= 1, f"perturb.{name}", getattr(self, name), ">= 1")
-
-    @classmethod
-    def paper(cls, **changes: object) -> PerturbSettings:
-        """Only what the paper describes, in its order: one snapshot, noise spheres, then holes."""
-        plain = cls(
-            path_probability=0, specular_probability=0, pass_probability=0, noise_by_distance=False,
-            ellipsoid_probability=0, noise_first=True, extra_probability=0, sparse_probability=0, thin=False,
-        )  # fmt: skip
-        return replace(plain, **changes)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +94,21 @@ def snapshot(mesh: Mesh, view: View, settings: PerturbSettings) -> Hits:
     )
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_spots(
+    points: Float32, spots: NDArray[np.int64], sigma: Float64, strength: Float64, weight: Float64
+) -> None:  # pragma: no cover - compiled
+    """Add to ``weight`` [n] a Gaussian about each spot (a number of a point) out to eight sigma."""
+    for k in range(len(spots)):
+        x, y, z = points[spots[k], 0], points[spots[k], 1], points[spots[k], 2]
+        scale, reach = -0.5 / (sigma[k] * sigma[k]), 64.0 * sigma[k] * sigma[k]
+        for i in range(len(points)):
+            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            square = dx * dx + dy * dy + dz * dz
+            if square < reach:
+                weight[i] += strength[k] * np.exp(square * scale)
+
+
 def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings, rng: np.random.Generator) -> Float64:
     """Weight of every hit when a few spots outshine the rest (ours); sums to 1.
 
@@ -189,9 +121,7 @@ def specular_weights(points: Float32, cosine: Float32, settings: PerturbSettings
     sigma = rng.uniform(*settings.specular_radius_m, size=count)
     strength = rng.exponential(size=count) ** 2 + 0.1  # powers of spots differ by orders of magnitude
     weight = np.zeros(len(points))
-    for spot, one_sigma, one_strength in zip(spots, sigma, strength, strict=True):
-        away = points - points[spot]
-        weight += one_strength * np.exp(np.einsum("ij,ij->i", away, away) / (-2 * one_sigma**2))
+    _add_spots(points, spots, sigma, strength, weight)
     background = rng.uniform(*settings.specular_background)
     spread: Float64 = (1 - background) * weight / weight.sum() + background / len(points)
     return spread
@@ -289,7 +219,8 @@ def noise_spheres(points: Float32, position: Float64, settings: PerturbSettings,
 
 def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float32:
     """Odometry drift, outliers, ghosts of the ground and side-lobe streaks, each with its own chance (ours)."""
-    happens = rng.random(4) < settings.extra_probability
+    chances = (settings.drift_probability, settings.outlier_probability)
+    happens = rng.random(4) < (*chances, settings.ghost_probability, settings.streak_probability)
     count = len(points)
     if happens[0]:
         slope = rng.normal(0, settings.drift_sigma, 2)
@@ -297,11 +228,11 @@ def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: n
         points[:, :2] += (points[:, :2] @ view.along)[:, None] * slope
     added: list[NDArray[np.floating]] = [points]
     if happens[1]:
-        low, high = points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
+        low, high = points.min(axis=0) - settings.outlier_margin_m, points.max(axis=0) + settings.outlier_margin_m
         added.append(rng.uniform(low, high, (int(settings.outlier_share * count), 3)))
     if happens[2]:  # mirrored about a ground that is not quite flat; the part that stays above z = 0 survives the clip
         ghost = points[rng.choice(count, int(settings.ghost_share * count), replace=False)]
-        ghost[:, 2] = 2 * rng.normal(0, 0.1) - ghost[:, 2]
+        ghost[:, 2] = 2 * rng.normal(0, settings.ghost_ground_sigma_m) - ghost[:, 2]
         added.append(ghost)
     if happens[3]:
         added.append(
@@ -361,6 +292,7 @@ def perturb(
         points = noise_spheres(points, view.middle, settings, rng)
     if len(points) > 0:
         points = add_artefacts(points, view, settings, rng)
-    low, high = settings.clip_z_m
-    points = points[(points[:, 2] > low) & (points[:, 2] < high)]
+    if settings.clip:
+        low, high = settings.clip_z_m
+        points = points[(points[:, 2] > low) & (points[:, 2] < high)]
     return points[rng.permutation(len(points))[: _final_count(settings, rng)]], view.middle

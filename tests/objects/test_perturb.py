@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from edge.errors import ConfigError
+from edge.frames import Float32
 from train.depth_scan import scan
 from train.objects.mesh import Mesh
 from train.objects.parametric import generate
@@ -178,7 +179,7 @@ def test_specular_weight_is_concentrated(car: Mesh) -> None:
 def test_artefacts_keep_the_range_of_streaks_and_the_points() -> None:
     points = np.random.default_rng(11).uniform(0.2, 1.5, (1000, 3)).astype(np.float32)
     view = View(0.0, np.array([[8.0, 0.0, 0.8]]), np.zeros((1, 3)))
-    streaks = replace(PLAIN, extra_probability=1.0, drift_sigma=0.0, outlier_share=0, ghost_share=0, streak_share=0.05)
+    streaks = replace(PLAIN, streak_probability=1.0, streak_share=0.05)
     added = add_artefacts(points, view, streaks, np.random.default_rng(12))
     np.testing.assert_array_equal(added[:1000], points)
     assert len(added) == 1050
@@ -187,6 +188,62 @@ def test_artefacts_keep_the_range_of_streaks_and_the_points() -> None:
     assert cKDTree(ranges[:, None]).query(moved[:, None])[0].max() < 1e-4  # same range
     assert cKDTree(points).query(added[1000:])[0].min() >= 0  # and no copy in place
     np.testing.assert_array_equal(add_artefacts(points, view, PLAIN, np.random.default_rng(13)), points)
+
+
+def test_each_artefact_has_its_own_switch_and_does_one_thing() -> None:
+    """Drift shears, outliers fill the widened box, ghosts lie below the ground; the given points stay as they are."""
+    points = np.random.default_rng(20).uniform(0.3, 1.5, (1000, 3)).astype(np.float32)
+    view = View(0.0, np.array([[8.0, 0.0, 0.8]]), np.zeros((1, 3)))
+
+    def only(**changes: float) -> Float32:
+        return add_artefacts(points, view, replace(PLAIN, **changes), np.random.default_rng(21))
+
+    drifted = only(drift_probability=1.0)
+    assert drifted.shape == points.shape
+    slope = (drifted - points)[:, :2] / points[:, 1:2]  # the path runs along y
+    np.testing.assert_allclose(slope, np.broadcast_to(slope[0], slope.shape), atol=1e-4)
+    assert 0 < np.abs(slope[0]).max() < 0.15
+    np.testing.assert_array_equal(drifted[:, 2], points[:, 2])
+    outliers = only(outlier_probability=1.0, outlier_share=0.1, outlier_margin_m=0.4)
+    np.testing.assert_array_equal(outliers[:1000], points)
+    assert len(outliers) == 1100
+    assert outliers.min() >= points.min() - 0.4
+    assert (np.abs(outliers[1000:] - 0.9) > 0.6).any()
+    ghosts = only(ghost_probability=1.0, ghost_share=0.2, ghost_ground_sigma_m=0.0)
+    np.testing.assert_array_equal(ghosts[:1000], points)
+    mirrored = ghosts[1000:] * np.array([1, 1, -1], np.float32)
+    assert len(mirrored) == 200
+    assert cKDTree(points).query(mirrored)[0].max() < 1e-6
+
+
+def test_the_paper_does_four_things_in_its_order(car: Mesh) -> None:
+    """Camera, snapshot, noise spheres, holes, put together here by hand; every addition of ours is off."""
+    settings = PerturbSettings.paper()
+    off = [f.name for f in fields(settings) if f.name.endswith("_probability")]
+    assert len(off) == 9
+    assert all(getattr(settings, name) == 0 for name in off)
+    assert (settings.noise, settings.holes, settings.noise_first) == (True, True, True)
+    assert (settings.clip, settings.thin, settings.noise_by_distance) == (False, False, False)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        view = draw_view(car, settings, rng)
+        expected = noise_spheres(
+            base_sample(snapshot(car, view, settings), view, settings, rng), view.middle, settings, rng
+        )
+        expected, _ = cut_holes(expected, float(np.linalg.norm(car.size_m)), settings, rng)
+        points, _ = perturb(car, replace(settings, max_points=100_000), np.random.default_rng(seed))
+        assert len(points) == len(expected)
+        np.testing.assert_array_equal(np.unique(points, axis=0), np.unique(expected, axis=0))
+
+
+def test_every_step_can_be_left_out(car: Mesh) -> None:
+    """Without a step the result differs from the one with it; with all off only points of the surface are left."""
+    full = {f.name: 1.0 for f in fields(PerturbSettings) if f.name.endswith("_probability")}
+    on = replace(PerturbSettings(), **full)  # type: ignore[arg-type]
+    before, _ = perturb(car, on, np.random.default_rng(30))
+    for name in [*full, "holes", "noise", "noise_by_distance", "clip"]:
+        after, _ = perturb(car, replace(on, **{name: False}), np.random.default_rng(30))  # type: ignore[arg-type]
+        assert before.shape != after.shape or not np.array_equal(before, after), name
 
 
 def test_all_steps_stay_inside_the_limits_and_never_pad(car: Mesh) -> None:
