@@ -120,17 +120,25 @@ class Pipeline:
         rig: radars, geometry and settings.
         completion: the network; None: fused clouds and objects only.
         sinks: called in order with every result.
+        imaging: radar id -> imager and detector that were made before for these radars and settings; None: made here.
     """
 
-    def __init__(self, rig: Rig, completion: CompletionModel | None, sinks: Sequence[Sink] = ()) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        completion: CompletionModel | None,
+        sinks: Sequence[Sink] = (),
+        imaging: Mapping[RadarId, tuple[Imager, Detector]] | None = None,
+    ) -> None:
         settings = rig.settings
         self.rig, self.sinks, self._completion = rig, list(sinks), completion
         self.radars: tuple[RadarId, ...] = tuple(radar for radar in RADARS if radar in rig.radars)
         self.times, self.faults = StageTimes(), Faults()
         self._pairer = FramePairer(self.radars)
         self.ledgers: dict[RadarId, FrameLedger] = self._pairer.ledgers
-        self._imagers = {r: Imager(rig.radars[r], settings.heatmap, settings.antenna) for r in self.radars}
-        self._detectors = {r: Detector(rig.radars[r], settings.cfar) for r in self.radars}
+        made = imaging or {r: _imaging(rig, r) for r in self.radars}
+        self._imagers = {r: made[r][0] for r in self.radars}
+        self._detectors = {r: made[r][1] for r in self.radars}
         self._track = PoseTrack(settings.fusion.max_pose_gap_s)
         self._associator = Associator(rig) if len(self.radars) == len(RADARS) else None
         self._fusion = TemporalFusion(settings.fusion)
@@ -308,3 +316,8 @@ class Pipeline:
             self.faults.shapes_withheld += 1
             self.faults.last = str(error)
             return None
+
+
+def _imaging(rig: Rig, radar: RadarId) -> tuple[Imager, Detector]:
+    board, settings = rig.radars[radar], rig.settings
+    return Imager(board, settings.heatmap, settings.antenna), Detector(board, settings.cfar)
