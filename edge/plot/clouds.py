@@ -82,7 +82,10 @@ def _view(axes: Any, layer: Layer, side: tuple[str, int, int], limits: list[tupl
     name, across, up = side
     axes.scatter(
         *(layer.xyz_m[:, across], layer.xyz_m[:, up]),
-        s=5, c=layer.colour, alpha=layer.weight if len(layer.weight) else None, linewidths=0,
+        s=5,
+        c=layer.colour,
+        alpha=layer.weight if len(layer.weight) else None,
+        linewidths=0,
     )
     dress(axes, name, AXIS_LABEL[across], AXIS_LABEL[up])
     axes.set_xlim(*limits[across])

@@ -48,7 +48,7 @@ class PictureCollector:
         """Keep a copy of the heatmaps when no earlier frame had more detections."""
         count = sum(map(len, result.detections.values()))
         if self._best is None or count > self._best[0]:
-            copies = {radar: _copy(heatmap) for radar, heatmap in result.heatmaps.items()}
+            copies = {radar: copy_heatmap(heatmap) for radar, heatmap in result.heatmaps.items()}
             self._best = (count, copies, dict(result.detections))
         if result.pose is not None and len(self._frames) < MAX_KEPT_FRAMES:
             self._frames.append((result.pose, dict(result.detections)))
@@ -114,7 +114,8 @@ def to_object_frame(points_odom_m: Float32, pose: Pose) -> Float32:
     return np.asarray((points_odom_m - pose.position_m) @ rotation_matrix(pose.quaternion_xyzw), dtype=np.float32)
 
 
-def _copy(heatmap: Heatmap) -> Heatmap:
+def copy_heatmap(heatmap: Heatmap) -> Heatmap:
+    """The power of a heatmap for keeping, without its Doppler maps."""
     return Heatmap(
         *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, heatmap.power.copy()),
         *(heatmap.direction_cosine, heatmap.range_m, heatmap.response),

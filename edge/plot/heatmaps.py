@@ -35,15 +35,15 @@ def heatmap_picture(
         fov_deg: field of view of the association along each array, drawn as two rays.
     """
     number = next(iter(heatmaps.values())).number
-    limit_m = _limit_m(detections)
+    limit_m = range_limit_m(detections)
     size_in = (7.4, 5.8) if len(heatmaps) == 1 else (12.6, 6.6)
     figure = new_figure(*size_in, f"Range-angle heatmaps and CFAR detections, frame {number}", subtitle)
     for axes, (radar, heatmap) in zip(_row(figure, len(heatmaps)), heatmaps.items(), strict=True):
-        _panel(figure, axes, heatmap, detections[radar], limit_m, np.radians(fov_deg))
+        heatmap_panel(figure, axes, heatmap, detections[radar], limit_m, np.radians(fov_deg))
     return write(figure, path)
 
 
-def _limit_m(detections: Mapping[RadarId, Detections]) -> float:
+def range_limit_m(detections: Mapping[RadarId, Detections]) -> float:
     """Range up to which cells are drawn: somewhat beyond nearly all detections."""
     ranges = np.concatenate([found.range_m for found in detections.values()])
     reach_m = 1.5 * float(np.percentile(ranges, 90)) if len(ranges) else FARTHEST_LIMIT_M
@@ -55,7 +55,8 @@ def _row(figure: Any, count: int) -> list[Any]:
     return list(np.atleast_1d(figure.subplots(1, count, width_ratios=ratios)).ravel())
 
 
-def _panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m: float, fov_rad: float) -> None:
+def heatmap_panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m: float, fov_rad: float) -> None:
+    """One radar's heatmap and detections up to ``limit_m`` into ``axes``, with a colour bar of ``figure``."""
     from_above = heatmap.radar == "horizontal"
     power_db, along_m, forward_m = _cartesian(heatmap, limit_m)
     top_db = float(power_db[:, heatmap.range_m[: power_db.shape[1]] > 1.0].max())
