@@ -14,7 +14,6 @@ Times are nanoseconds of CLOCK_MONOTONIC unless a name says otherwise; the insta
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -158,8 +157,8 @@ class Heatmap:
         doppler: maps whose largest value ``power`` holds; None: Doppler was not kept.
         motion: what was steered with; None: the scene is shown as at the first chirp.
         maps: number of maps of different speeds whose largest value ``power`` holds.
-        sweep_rad: phase, rms over the channels, by which a cell's noise changes from the first of these maps to the
-            last; infinite: their noise is independent.
+        map_correlation: float64 [maps, angle], |rho|^2 of the noise of two cells by the difference of their maps and of
+            their angle bins, both upwards; None: one map, or maps of independent noise.
     """
 
     radar: RadarId
@@ -172,7 +171,7 @@ class Heatmap:
     doppler: DopplerMaps | None = None
     motion: BurstMotion | None = None
     maps: int = 1
-    sweep_rad: float = math.inf
+    map_correlation: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

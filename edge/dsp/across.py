@@ -57,10 +57,11 @@ class AcrossMotion:
         gain: Float32,
     ) -> None:
         self.step_m_s = 2.0 * LARGEST_ERROR_RAD / max(rad_s_m, 1e-9)
-        weight = np.square(geometry.channel_weight(angle_taper)).sum(axis=1)
-        spread_s2 = np.average(np.square(transmit_time_s - np.average(transmit_time_s, weights=weight)), weights=weight)
-        self._spread_s2, self._loop_s2 = float(spread_s2), loop_time_s**2 / 12.0
-        self._wavenumber = 4.0 * math.pi / wavelength_m
+        self._noise = np.square(geometry.channel_weight(angle_taper))
+        self._element, self._bins = geometry.element, shape[0]
+        self._turns_per_step = 2.0 * self.step_m_s / wavelength_m
+        self._time_s, self._loop_time_s = transmit_time_s, loop_time_s
+        self._correlations: dict[tuple[int, int], Float64] = {}
         self._pattern = np.asarray(1.0 / gain, dtype=np.float32)
         self._response = self._responses(geometry, angle_taper, transmit_time_s / wavelength_m, shape[0])
         self._count = 0
@@ -90,10 +91,21 @@ class AcrossMotion:
         steps = min(math.ceil(most), MOST_STEPS) if most > 0.5 else 0
         return np.asarray(np.arange(-steps, steps + 1) * self.step_m_s, dtype=np.float64)
 
-    def sweep_rad(self, maps: int, loops: int) -> float:
-        """How far a cell's noise turns from the first of ``maps`` to the last, rms over channels and steered loops."""
-        spread_s = math.sqrt(self._spread_s2 + self._loop_s2 * (loops**2 - 1))
-        return self._wavenumber * spread_s * self.step_m_s * (maps - 1)
+    def correlation(self, maps: int, loops: int) -> Float64:
+        """|rho|^2 of the noise of two cells, float64 [maps, angle], by difference of maps and of angle bins.
+
+        rho(k, d) = sum_c n_c exp(j 2 pi (e_c d / bins + 2 k v t_c / lambda)) / sum_c n_c over channels and ``loops``,
+        n_c the noise power after the window, v the step of speeds.
+        """
+        if (maps, loops) not in self._correlations:
+            time_s = self._time_s + self._loop_time_s * np.arange(loops)[:, None]
+            turn = np.exp(2j * np.pi * self._turns_per_step * np.arange(maps)[:, None, None] * time_s).mean(axis=1)
+            row = np.zeros((maps, self._bins), dtype=np.complex128)
+            for slot, receiver in zip(*np.nonzero(self._element >= 0), strict=True):
+                row[:, self._element[slot, receiver]] += self._noise[slot, receiver] * turn[:, slot]
+            rho = np.fft.ifft(row, axis=1) * self._bins / self._noise.sum()
+            self._correlations[maps, loops] = np.square(np.abs(rho))
+        return self._correlations[maps, loops]
 
     def keep(self, k: int, power: Float32) -> None:
         """Take over map ``k`` [angle, range]; map 0 first."""

@@ -14,9 +14,9 @@ from edge.dsp.interpolation import PARABOLA
 from edge.dsp.kernels_cfar import SPARE_ROWS, mean_decisions, mean_peaks, ring_halves_kernel, ring_mean_kernel
 from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
 from edge.dsp.kernels_rank import SELECTED, rank_decisions_kernel, rank_noise_kernel, rank_peaks_kernel
+from edge.dsp.maximum import Maximum
 from edge.dsp.ring_tables import RingTables
-from edge.dsp.threshold import Maximum
-from edge.frames import Detections, Float32, Heatmap, PointResponse
+from edge.frames import Detections, Float32, Float64, Heatmap, PointResponse
 
 if TYPE_CHECKING:
     from edge.rig import Radar
@@ -51,7 +51,8 @@ class Detector:
         self._bounds: tuple[Float32, ...] | None = None
         self._ends_m = (np.nan, np.nan)
         self._response: PointResponse | None = None
-        self._maximum: Maximum | None = None
+        self._maps: tuple[int, int] | None = None
+        self._factors: dict[tuple[int, int], tuple[Float32, Float64 | None]] = {}
         self._axes = np.zeros(8)
         self._margin = 10.0 ** (0.1 * settings.sidelobe_margin_db)
         self._value = np.zeros(settings.max_detections, dtype=np.float32)
@@ -133,7 +134,8 @@ class Detector:
         train = self.settings.train_angle
         require(2 * train < angles, "cfar.train_angle", train, f"at most {(angles - 1) // 2} for {angles} angle bins")
         self._first = int(np.searchsorted(range_m, self.settings.min_range_m))
-        self._tables, self._maximum = RingTables.of(self.settings, ranges, self._first), None
+        self._tables, self._maps = RingTables.of(self.settings, ranges, self._first), None
+        self._factors.clear()
         width = ranges + 2 * self.settings.train_range + self.settings.guard_range
         self._line = _plane(4, width)
         self._full, self._side = (_plane(angles + 2 * train + SPARE_ROWS, width) for _ in range(2))
@@ -155,11 +157,25 @@ class Detector:
         """What points and noise look like, taken over only when it is something else than in the last heatmap."""
         if heatmap.response is not self._response:
             self._take_over(heatmap.response)
-        maximum = Maximum(heatmap.maps, heatmap.sweep_rad)
-        if maximum != self._maximum:
-            settings = self.settings
-            self._factor = maximum.factor(settings.kind, self._tables.factor, settings.p_fa, settings.os_quantile)
-            self._maximum = maximum
+        maps = (heatmap.maps, id(heatmap.map_correlation))
+        if maps == self._maps:
+            return
+        if maps not in self._factors:
+            self._factors[maps] = self._factor_of(heatmap), heatmap.map_correlation
+        self._factor, self._maps = self._factors[maps][0], maps
+
+    def _factor_of(self, heatmap: Heatmap) -> Float32:
+        """Factors for the largest of the heatmap's maps."""
+        if heatmap.maps == 1:
+            return self._tables.factor
+        correlation, response = heatmap.map_correlation, heatmap.response
+        if correlation is None:
+            correlation = np.zeros((heatmap.maps, heatmap.power.shape[0]))
+            correlation[0, 0] = 1.0
+            if response is not None and response.angle_correlation is not None:
+                correlation[0] = np.square(np.abs(response.angle_correlation))
+        maximum = Maximum.of(correlation)
+        return RingTables.of(self.settings, self._shape[1], self._first, response, maximum).factor
 
     def _take_over(self, response: PointResponse | None) -> None:
         self._pattern[:] = 1.0
@@ -171,7 +187,8 @@ class Detector:
             self._axes[4:7] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
             self._axes[7] = response.range_spread_bins
             self._look_up_sidelobes(response)
-        self._tables, self._maximum = RingTables.of(self.settings, self._shape[1], self._first, response), None
+        self._tables, self._maps = RingTables.of(self.settings, self._shape[1], self._first, response), None
+        self._factors.clear()
 
     def _look_up_sidelobes(self, response: PointResponse) -> None:
         """Bounds of a point's power by distance in bins; off without them."""

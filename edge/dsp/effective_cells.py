@@ -25,6 +25,9 @@ Every c^n is a product over both axes and a ring is a box less a box, so that no
 The tested cell, of power X, shares noise with its ring as well: given X, the mean of a ring, and in first order every
 quantile, is 1 - k + k X times its own, k = sum_j c_0j / N. X > T m (1 - k + k X) is X > T' m with T' = T (1 - k) /
 (1 - T m k), so that a factor T' for independent cells becomes T = T' / (1 - k + T' m k), m = 1 or the quantile x.
+
+Cells that hold the largest of several maps have another correlation C, and beta C / (1 - (1 - beta) C) in the place of
+c, sum_n beta (1 - beta)^(n-1) C^n (edge/dsp/maximum.py); powers of C are products over both axes as well.
 """
 
 from __future__ import annotations
@@ -39,9 +42,9 @@ from edge.frames import Float64
 
 Complex128 = NDArray[np.complex128]
 HALVINGS = 60
-
 ORDERS = 128
 """Terms of the expansion; what is left of it beyond counts on the diagonal, where it converges slowest."""
+REST = 1e-9
 
 
 def noise_correlation(noise: Float64, bins: int) -> Complex128:
@@ -84,13 +87,15 @@ class Ring:
         Returns:
             float64 [n].
         """
-        power = order[:, None, None]
-        a, r = np.square(np.abs(_matrix(self.angle, along))), np.square(np.abs(_matrix(self.ranges, across)))
-        forms = [
-            np.stack((m @ box @ box, m @ box @ guard, m @ guard @ guard))
-            for m, box, guard in ((a**power, self.angle, self.guard_angle), (r**power, self.ranges, self.guard_ranges))
-        ]
-        return np.asarray(np.array([1.0, -2.0, 1.0]) @ (forms[0] * forms[1]))
+        forms = []
+        for correlation, box, guard in (
+            (along, self.angle, self.guard_angle),
+            (across, self.ranges, self.guard_ranges),
+        ):
+            lag = np.arange(1 - len(box), len(box)) % len(correlation)
+            pairs = [np.correlate(one, other, "full") for one, other in ((box, box), (box, guard), (guard, guard))]
+            forms.append(np.square(np.abs(correlation[lag])) ** order[:, None] @ np.stack(pairs, axis=1))
+        return np.asarray((forms[0] * forms[1]) @ np.array([1.0, -2.0, 1.0]))
 
     def triple_sum(self, along: Complex128, across: Complex128) -> float:
         """Sum of rho_ij rho_jk rho_ki over all triples of cells, tr(rho^3)."""
@@ -111,8 +116,8 @@ def _matrix(offsets: Float64, correlation: Complex128) -> Complex128:
     return np.asarray(correlation[(offset[:, None] - offset[None, :]) % len(correlation)])
 
 
-def mean_cells(ring: Ring, along: Complex128, across: Complex128, factor: float) -> float:
-    """N_e of the mean of a ring's cells for a threshold ``factor``; 0 for an empty ring."""
+def mean_cells(ring: Ring, along: Complex128, across: Complex128, factor: float, share: float = 1.0) -> float:
+    """N_e of the mean of a ring's cells for a threshold ``factor``; 0 for an empty ring; ``share``: beta above."""
     if ring.cells == 0:
         return 0.0
     variance = float(ring.pair_sum(along, across, np.array([1]))[0]) / ring.cells**2
@@ -127,32 +132,65 @@ def mean_cells(ring: Ring, along: Complex128, across: Complex128, factor: float)
             low = middle
         else:
             high = middle
-    return high
+    if share == 1.0:
+        return high
+    orders = _orders(share)
+    return high * variance * ring.cells**2 / float(_geometric(share, orders) @ ring.pair_sum(along, across, orders))
 
 
-def rank_cells(ring: Ring, along: Complex128, across: Complex128, quantile: float) -> float:
-    """N_e of the ordered statistic at ``quantile`` (between 0 and 1); 0 for an empty ring."""
+def rank_cells(ring: Ring, along: Complex128, across: Complex128, quantile: float, share: float = 1.0) -> float:
+    """N_e of the ordered statistic at ``quantile`` (between 0 and 1); 0 for an empty ring; ``share``: beta above."""
     if ring.cells == 0:
         return 0.0
     variance = quantile * (1.0 - quantile)
-    weight = _laguerre_weights(-math.log1p(-quantile))
+    weight = _thinned(_laguerre_weights(-math.log1p(-quantile)), share)
     total = float(weight @ ring.pair_sum(along, across, np.arange(1, ORDERS + 1)))
     rest = max(variance - float(weight.sum()), 0.0)
     return ring.cells**2 * variance / (total + rest * ring.cells)
 
 
-def shared_noise(ring: Ring, along: Complex128, across: Complex128) -> float:
+def shared_noise(ring: Ring, along: Complex128, across: Complex128, share: float = 1.0) -> float:
     """k, the mean correlation of a ring's cells with the tested cell in its middle; 0 for an empty ring."""
     if ring.cells == 0:
         return 0.0
-    box = _from_middle(ring.angle, along) * _from_middle(ring.ranges, across)
-    guard = _from_middle(ring.guard_angle, along) * _from_middle(ring.guard_ranges, across)
-    return (box - guard) / ring.cells
+    orders = _orders(share)
+    box = _from_middle(ring.angle, along, orders) * _from_middle(ring.ranges, across, orders)
+    guard = _from_middle(ring.guard_angle, along, orders) * _from_middle(ring.guard_ranges, across, orders)
+    return float(_geometric(share, orders) @ (box - guard)) / ring.cells
 
 
-def _from_middle(box: Float64, correlation: Complex128) -> float:
+def _from_middle(box: Float64, correlation: Complex128, orders: NDArray[np.int64]) -> Float64:
     offset = np.arange(len(box)) - len(box) // 2
-    return float(box @ np.square(np.abs(correlation[offset % len(correlation)])))
+    return np.asarray(np.square(np.abs(correlation[offset % len(correlation)])) ** orders[:, None] @ box)
+
+
+def _orders(share: float) -> NDArray[np.int64]:
+    """Powers whose coefficients add up to 1 within ``REST``."""
+    count = 1 if share == 1.0 else min(math.ceil(math.log(REST) / math.log1p(-share)), ORDERS)
+    return np.arange(1, count + 1)
+
+
+def _geometric(share: float, orders: NDArray[np.int64]) -> Float64:
+    """Coefficients of beta c / (1 - (1 - beta) c); the last takes what is left, so that c = 1 stays 1."""
+    weight = share * (1.0 - share) ** (orders - 1.0)
+    weight[-1] += 1.0 - weight.sum()
+    return np.asarray(weight)
+
+
+def _thinned(weight: Float64, share: float) -> Float64:
+    """Coefficients of sum_m w_m (beta c / (1 - (1 - beta) c))^m in powers of c: negative binomial.
+
+    The coefficient of c^n in the m-th power is that of c^(n - 1) in the (m - 1)-th, times beta, plus that of c^(n - 1)
+    in the m-th, times 1 - beta.
+    """
+    if share == 1.0:
+        return weight
+    row, thinned = np.zeros(len(weight) + 1), np.zeros(len(weight))
+    row[0] = 1.0
+    for n in range(len(weight)):
+        row = np.concatenate(([0.0], share * row[:-1] + (1.0 - share) * row[1:]))
+        thinned[n] = row[1:] @ weight
+    return thinned
 
 
 def effective_rank(rank: int, cells: int, effective: float) -> float:

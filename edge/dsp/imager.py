@@ -298,8 +298,8 @@ class Imager:
             self._undo_motion(choice, forward_m_s, along_m_s, speed_m_s, False)
             self._across.keep(k, self._power)
         self._across.settle(self._power)
-        sweep_rad = self._across.sweep_rad(len(speeds_m_s), choice.loops if choice.name == "steer" else 1)
-        return replace(heatmap, motion=motion, maps=len(speeds_m_s), sweep_rad=sweep_rad)
+        correlation = self._across.correlation(len(speeds_m_s), choice.loops if choice.name == "steer" else 1)
+        return replace(heatmap, motion=motion, maps=len(speeds_m_s), map_correlation=correlation)
 
     def _run_range(self, adc: NDArray[np.int32], loops: int, blocks: int | None = None) -> int:
         """Fill ``_spectra`` from the raw words, summed over loops; returns the codes at the rails."""

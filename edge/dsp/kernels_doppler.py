@@ -183,6 +183,8 @@ def spread(cube, slot, loops, turn, first, taps, line, row):  # type: ignore[no-
                 line[1, k] = source[0, k] * ti + source[1, k] * tr
             for j in range(TAPS):
                 cell, tap = first[l, c] + j, taps[l, c, j]
+                if tap == 0:
+                    continue
                 for part in range(2):
                     target, turned = row[part, cell], line[part]
                     for k in range(points):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge.config import CfarSettings
 from edge.dsp.effective_cells import Complex128, Ring, effective_rank, mean_cells, rank_cells, shared_noise
+from edge.dsp.maximum import Maximum
 from edge.dsp.threshold import cfar_scale, os_rank
 from edge.frames import Float32, PointResponse
 
@@ -44,32 +45,43 @@ class RingTables:
     allowed: NDArray[np.int64]
 
     @classmethod
-    def of(cls, settings: CfarSettings, ranges: int, first: int, response: PointResponse | None = None) -> RingTables:
+    def of(
+        cls,
+        settings: CfarSettings,
+        ranges: int,
+        first: int,
+        response: PointResponse | None = None,
+        maximum: Maximum | None = None,
+    ) -> RingTables:
         """Tables for ``ranges`` cells of which those below ``first`` do not count.
 
         Args:
             settings: ring, kind, probability.
             ranges, first: cells.
             response: gives the correlation of the cells; without one they count as independent.
+            maximum: of the maps that every cell holds the largest of; none: one map.
         """
         along, across = INDEPENDENT, INDEPENDENT
         if settings.correlated and response is not None:
             along = INDEPENDENT if response.angle_correlation is None else response.angle_correlation
+            if maximum is not None:
+                along = np.sqrt(maximum.correlation).astype(np.complex128)
             across = INDEPENDENT if response.range_correlation is None else response.range_correlation
         factor, inverse = np.zeros(ranges, dtype=np.float32), np.zeros((2, ranges), dtype=np.float32)
         allowed, cells = np.zeros(ranges, dtype=np.int64), np.zeros(ranges, dtype=np.int64)
-        known: dict[tuple[int, int], float] = {}
+        cuts: dict[tuple[int, int], list[int]] = {}
         for r in range(ranges):
             cut = (max(first, r - settings.train_range) - r, min(ranges - 1, r + settings.train_range) - r)
+            cuts.setdefault(cut, []).append(r)
+        for cut, at in cuts.items():
             whole = _ring(settings, *cut)
             counted: tuple[Ring, ...] = (whole,)
             if settings.kind in ("go", "so"):
                 counted = (_ring(settings, cut[0], min(cut[1], -1)), _ring(settings, max(cut[0], 1), cut[1]))
-            cells[r], allowed[r] = whole.cells, whole.cells - os_rank(whole.cells, settings.os_quantile)
-            inverse[: len(counted), r] = [1.0 / part.cells if part.cells else 0.0 for part in counted]
-            if cut not in known:
-                known[cut] = _scale(settings, counted, along, across)
-            factor[r] = known[cut]
+            cells[at], allowed[at] = whole.cells, whole.cells - os_rank(whole.cells, settings.os_quantile)
+            for half, part in enumerate(counted):
+                inverse[half, at] = 1.0 / part.cells if part.cells else 0.0
+            factor[at] = _scale(settings, counted, along, across, maximum)
         floor = np.where((inverse == 0.0) & (settings.kind == "so"), NO_HALF, np.float32(0.0))
         return cls(first, cells, factor, inverse, floor, allowed)
 
@@ -84,23 +96,27 @@ def _ring(settings: CfarSettings, low: int, high: int) -> Ring:
     return Ring(np.ones(len(angle)), beside.astype(float), inside.astype(float), guarded.astype(float))
 
 
-def _scale(settings: CfarSettings, counted: tuple[Ring, ...], along: Complex128, across: Complex128) -> float:
+def _scale(
+    settings: CfarSettings, counted: tuple[Ring, ...], along: Complex128, across: Complex128, maximum: Maximum | None
+) -> float:
     """Threshold factor of one cut ring, infinite where nothing is left of it."""
     cells = sum(ring.cells for ring in counted)
     if cells == 0:
         return float("inf")
-    shared = [shared_noise(ring, along, across) for ring in counted if ring.cells]
+    share = 1.0 if maximum is None else maximum.share
+    shared = [shared_noise(ring, along, across, share) for ring in counted if ring.cells]
+    scale = cfar_scale if maximum is None else maximum.scale
     level = 1.0
     if settings.kind == "os":
         rank = os_rank(cells, settings.os_quantile)
-        share = (rank - 0.5) / cells
-        effective = rank_cells(counted[0], along, across, share)
-        factor = cfar_scale("os", effective, settings.p_fa, effective_rank(rank, cells, effective))
-        level = -math.log1p(-share)
+        quantile = (rank - 0.5) / cells
+        effective = rank_cells(counted[0], along, across, quantile, share)
+        factor = scale("os", effective, settings.p_fa, effective_rank(rank, cells, effective))
+        level = -math.log1p(-quantile) if maximum is None else maximum.quantile(quantile) / maximum.mean
     else:
         factor = -math.log(settings.p_fa)
-        for _ in range(ROUNDS):
-            halves = [mean_cells(ring, along, across, factor) for ring in counted]
-            factor = cfar_scale(settings.kind, halves[0], settings.p_fa, other=halves[-1])
+        for _ in range(ROUNDS if maximum is None else 1):
+            halves = [mean_cells(ring, along, across, factor, share) for ring in counted]
+            factor = scale(settings.kind, halves[0], settings.p_fa, other=halves[-1])
     k = sum(shared) / len(shared)
     return factor / (1.0 - k + factor * level * k)

@@ -30,6 +30,8 @@ DENSITY_REACH = 4
 DENSITY_SHARE = 0.75
 """Density counts by sinc^2(0.75 x), whose spectrum ends at 3/4 of the grid's period: the field of view."""
 ANGLE_LANES = 32
+STILL_CELLS = 0.02
+"""Elements that move by less stay on the grid, which is exact in every direction."""
 
 
 class Steering:
@@ -73,7 +75,9 @@ class Steering:
         some = slice(None, None, FRACTIONS // 128)
         turns = np.outer((np.arange(bins) - bins // 2) / bins, away[some])
         spectrum = np.cos(2.0 * np.pi * turns) @ self._shape[some].ravel() / 128
-        self._gain = (gain / np.square(spectrum)).astype(np.float32)
+        self._gain, self._still_gain = (gain / np.square(spectrum)).astype(np.float32), gain
+        self._still_shape = np.zeros((1, TAPS))
+        self._still_shape[0, TAPS // 2 - 1] = 1.0
         loops, slots = time_s.shape
         self._fine = np.zeros((2, (bins + 2 * MARGIN) * FINE + len(self._density)))
         self._weight = np.zeros(loops * len(self._slot))
@@ -143,12 +147,15 @@ class Steering:
         travel = abs(drift) * span_s
         whole = self.count + travel + 2 * MARGIN > self.bins // 2
         row = self._rows[whole]
+        middle, shape, gain = float(row.shape[1] // 2), self._shape, self._gain
+        if travel < STILL_CELLS:
+            middle, shape, gain, drift = middle - 0.5 * (1 - self.count % 2), self._still_shape, self._still_gain, 0.0
         plan_spreading(
-            *(self._position, self._slot, self._centred_s, drift, float(row.shape[1] // 2), loops),
-            *(self._density, self._taper, self._shape, self._fine, self._weight, self._first, self._taps),
+            *(self._position, self._slot, self._centred_s, drift, middle, loops),
+            *(self._density, self._taper, shape, self._fine, self._weight, self._first, self._taps),
         )
         set_turns(self._turn, self._centred_s, closing_m_s - slope_m_s * sector.centre, self._wavelength_m)
         spread(cube, self._slot, loops, self._turn, self._first, self._taps, self._line, row)
         self._angle_kernels[whole](
-            *(row, self._twiddle, self._target, self._gain, sector.first, sector.last, self._work, power)
+            *(row, self._twiddle, self._target, gain, sector.first, sector.last, self._work, power)
         )

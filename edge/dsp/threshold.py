@@ -5,19 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
 
 from edge.config import CfarKind, require
-from edge.frames import Float32
 
 BISECTIONS = 200
 FRACTION_TERMS = 500
 SMALLEST = 1e-300
-LARGEST = 40.0
-POINTS = 8000
-"""Levels up to ``LARGEST`` times the mean at which a distribution is known."""
 
 
 def cfar_scale(kind: CfarKind, cells: float, p_fa: float, rank: float = 0.0, other: float = 0.0) -> float:
@@ -51,54 +44,6 @@ def cfar_scale(kind: CfarKind, cells: float, p_fa: float, rank: float = 0.0, oth
         require(0.0 < rank <= cells + 0.5, "cfar rank", rank, f"1..{cells:g}")
         return _root(lambda factor: _log_p_fa_os(cells, rank, factor), math.log(p_fa))
     return _root(lambda factor: _log_p_fa_halves(kind == "go", cells, other, factor), math.log(p_fa))
-
-
-@dataclass(frozen=True, slots=True)
-class Maximum:
-    """Noise of a cell that holds the largest of several exponential powers of mean 1.
-
-    Independent powers have F(x) = (1 - exp(-x))^n. Maps between which noise turns continuously by a phase D, rms over
-    the channels, cross a level x upwards D sqrt(x / pi) exp(-x) times (Rice 1944), and F(x) = (1 - q) exp(-D sqrt(x /
-    pi) q / (1 - q)), q = exp(-x), when crossings are independent (Vanmarcke 1975).
-
-    Args:
-        maps: n.
-        sweep_rad: D; infinite: independent.
-    """
-
-    maps: int
-    sweep_rad: float
-
-    def factor(self, kind: CfarKind, factor: Float32, p_fa: float, quantile: float) -> Float32:
-        """Threshold factors from those for one map.
-
-        The level x of F(x) = 1 - p takes the place of ln(1 / p); mean (CA, GO, SO) or quantile (OS) of F that of one
-        map's. What a factor exceeds ln(1 / p) by is the ring's scatter and shrinks with its relative variance.
-
-        Args:
-            kind: of the detector.
-            factor: float32 [n], for one map.
-            p_fa: designed probability.
-            quantile: of the ordered statistic.
-        """
-        if self.maps == 1 or self.sweep_rad == 0.0:
-            return factor
-        x = np.arange(0.5, POINTS) * (LARGEST / POINTS)
-        q = np.exp(-x)
-        log = self.maps * np.log1p(-q)
-        if math.isfinite(self.sweep_rad):
-            log = np.maximum(log, np.log1p(-q) - self.sweep_rad * np.sqrt(x / math.pi) * q / (1.0 - q))
-        share, beyond = np.exp(log), -np.expm1(log)
-        one = -math.log(p_fa)
-        wanted = float(np.interp(one, -np.log(beyond), x))
-        mean = float(beyond.sum() * LARGEST / POINTS)
-        square = 2.0 * float((x * beyond).sum() * LARGEST / POINTS)
-        level, level_of_one = mean, 1.0
-        if kind == "os":
-            level, level_of_one = float(np.interp(quantile, share, x)), -math.log1p(-quantile)
-        scatter = factor * level_of_one / one - 1.0
-        variance = (square / mean**2 - 1.0) * wanted / one
-        return np.asarray(wanted / level * (1.0 + scatter * variance), dtype=np.float32)
 
 
 def os_rank(cells: int, quantile: float) -> int:
