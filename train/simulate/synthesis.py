@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point scatterers to one radar's raw samples: exact spherical paths of every channel by a non-uniform FFT.
+
+The beat signal is that of docs/architecture.md: x(t) = sum over the scatterers of a exp(j 2 pi (f_c tau + S tau t)),
+tau = (|p - A| + |p - B|) / c, t from the middle of the ADC window. Every chirp sees the scatterers where they are at
+its start. Distances are float64; from their fractional wavelengths on, everything is float32.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.config import require
+from edge.errors import RfconstructError
+from edge.frames import Complex64, Float32, Float64, Int16, Layout, RadarFrame
+from edge.reference.point_targets import element_positions_m
+from edge.waveform import SPEED_OF_LIGHT_M_S
+from train.simulate.kernels_synthesis import (
+    BLOCK,
+    LANES,
+    LEG,
+    RX,
+    filter_amplitudes,
+    fold,
+    receive_legs,
+    spreader,
+    transmit_legs,
+    turn_legs,
+)
+from train.simulate.scatterers import GroundPlane, Scatterers
+
+if TYPE_CHECKING:
+    from edge.rig import Radar
+    from train.simulate.front_end import FrontEnd
+
+SHAPES = {3: 0.60, 4: 0.52, 5: 0.44, 6: 0.38}
+"""By width: b of the weights exp(-b distance^2), balanced between cut tails and images, found by a sweep."""
+GROUP_CELLS = 0.3
+"""A group's receivers may lie this far from their middle, in grid cells of path."""
+FEWEST_SAMPLES = 64
+FIRST_ROOM = 1024
+
+
+class RangeError(RfconstructError):
+    """A scatterer whose beat frequency the receiver does not pass: it would appear at a false range."""
+
+
+@dataclass(slots=True)
+class _Work:
+    """Buffers of one synthesis, for ``room`` scatterers at most; axes as the kernels name them."""
+
+    room: int
+    points: Float64
+    velocity: Float64
+    bend: Float64
+    amplitude: Float32
+    phasor: Float32
+    cell_out: Float32
+    base_out: NDArray[np.int32]
+    reach_out: Float64
+    legs: Float32
+    turn: Float32
+    cell_back: Float32
+    base_back: NDArray[np.int32]
+    reach_back: Float64
+    plan: Float32
+    start: NDArray[np.int32]
+
+    @classmethod
+    def make(cls, room: int, slots: int, chips: int) -> _Work:
+        """Zeroed buffers."""
+        f4, f8 = np.float32, np.float64
+        return cls(
+            room=room,
+            points=np.zeros((2, 3, room), f8),
+            velocity=np.zeros((2, 3, room), f8),
+            bend=np.zeros(room, f8),
+            amplitude=np.zeros((2, room), f4),
+            phasor=np.zeros((slots, 2, room), f4),
+            cell_out=np.zeros((slots, room), f4),
+            base_out=np.zeros(room, np.int32),
+            reach_out=np.zeros((2, room), f8),
+            legs=np.zeros((chips, room, LEG), f4),
+            turn=np.zeros((chips, room, 2 * LANES), f4),
+            cell_back=np.zeros((2, chips, room), f4),
+            base_back=np.zeros(room, np.int32),
+            reach_back=np.zeros((2, room), f8),
+            plan=np.zeros((4, room), f4),
+            start=np.zeros(room, np.int32),
+        )
+
+
+class Synthesizer:
+    """Raw bursts of one radar from point scatterers.
+
+    Args:
+        radar: board, schedule, mounting; its calibration is not used.
+        width: grid cells to either side of a scatterer, 3 to 6; every one more lowers the error by about 15 dB.
+    Raises:
+        ConfigError: width out of range, fewer than 64 samples, or receivers of one chip too far apart for this
+            bandwidth.
+    """
+
+    def __init__(self, radar: Radar, width: int = 4) -> None:
+        require(width in SHAPES, "synthesis.width", width, f"{min(SHAPES)}..{max(SHAPES)}")
+        self.radar, self.width = radar, width
+        layout, profile = radar.schedule.layout, radar.schedule.profile
+        require(layout.samples >= FEWEST_SAMPLES, "samples", layout.samples, f">= {FEWEST_SAMPLES}")
+        require(layout.rx == RX, "receivers of one chip", layout.rx, str(RX))
+        self.reach_m = profile.usable_range_m
+        """Largest half path, as measured by the radar, of a scatterer that is accepted."""
+        self._layout: Layout = layout
+        self._cells = 2 * layout.samples
+        self._margin = width + 2
+        slope_per_m = profile.slope_hz_per_s_actual / SPEED_OF_LIGHT_M_S
+        self._scale = np.zeros(2 + layout.slots)
+        self._scale[:2] = slope_per_m * self._cells / profile.sample_rate_hz, 1.0 / profile.wavelength_m
+        self._jitter_turns_per_m_s = 2.0 * slope_per_m
+        self._offset_m = 2.0 * radar.mounting.range_offset_m
+        self._transmitters_m, receivers_m = element_positions_m(radar)
+        self._receivers_m = np.ascontiguousarray(receivers_m.reshape(-1, RX, 3))
+        self._centre_m = np.asarray(radar.mounting.position_m, dtype=np.float64)
+        spread_m = np.linalg.norm(self._receivers_m - self._receivers_m.mean(axis=1, keepdims=True), axis=2).max()
+        spread_cells = float(spread_m * self._scale[0])
+        require(spread_cells <= GROUP_CELLS, "receivers of one chip, apart in cells", spread_cells, f"<= {GROUP_CELLS}")
+        self._slot_s = profile.chirp_time_s
+        self._spread = spreader(width, SHAPES[width])
+        chips = len(self._receivers_m)
+        self._grid = np.zeros((chips, layout.slots, self._cells + self._margin, LANES), dtype=np.float32)
+        self._lines = np.zeros((chips, layout.slots, self._cells, RX), dtype=np.complex64)
+        self.correction = self._correction()
+        """float32 [samples]: takes the weights' own spectrum out of the inverse FFT."""
+        self._no_filter = np.ones(self._cells + 1, dtype=np.complex64)
+        self._scratch = np.zeros((2, RX, BLOCK))
+        self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
+        self._beat: Complex64 | None = None
+
+    def beat(self, scatterers: Scatterers, ground: GroundPlane | None = None) -> Complex64:
+        """Beat signal without noise and without the receiver's own faults.
+
+        Args:
+            scatterers: as this radar sees them in one burst.
+            ground: mirrors the antennas of ground paths; needed when there are any.
+        Returns:
+            complex64 [loops, slots, receivers, samples], LSB: a buffer that the next call overwrites. When nothing
+            moves it is a read-only view of one loop.
+        Raises:
+            RangeError: a scatterer beyond ``reach_m``, or nearer than the board's range offset.
+            ConfigError: ground paths without a ground.
+        """
+        layout = self._layout
+        loops = self._loops(scatterers)
+        shape = (loops, layout.slots, layout.devices * RX, layout.samples)
+        if self._beat is None or len(self._beat) != loops:
+            self._beat = np.empty(shape, dtype=np.complex64)
+        self._place(scatterers, ground, self._no_filter)
+        for loop in range(loops):
+            lines = self._synthesize(len(scatterers), loop, bool(scatterers.velocity_m_s.any()), None)
+            half = layout.samples // 2
+            samples = np.concatenate((lines[:, :, -half:], lines[:, :, : layout.samples - half]), axis=2)
+            samples *= self.correction[:, None]
+            self._beat[loop] = samples.transpose(1, 0, 3, 2).reshape(shape[1:])
+        return self._beat if loops > 1 else np.broadcast_to(self._beat, (layout.loops, *shape[1:]))
+
+    def _loops(self, scatterers: Scatterers) -> int:
+        """Loops that differ: all when anything moves."""
+        return self._layout.loops if bool(scatterers.velocity_m_s.any()) else 1
+
+    def _place(self, scatterers: Scatterers, ground: GroundPlane | None, response: Complex64) -> None:
+        """Take over the scatterers: mirrored legs, curvature of moving paths, receiver's response."""
+        k = len(scatterers)
+        if k > self._work.room:
+            self._work = _Work.make(1 << (k - 1).bit_length(), self._layout.slots, len(self._receivers_m))
+        work = self._work
+        for leg, image in enumerate((scatterers.tx_image, scatterers.rx_image)):
+            work.points[leg, :, :k] = scatterers.position_m.T
+            work.velocity[leg, :, :k] = scatterers.velocity_m_s.T
+            if image.any():
+                require(ground is not None, "ground", None, "the plane that the ground paths are mirrored in")
+                assert ground is not None
+                work.points[leg, :, :k][:, image] = ground.mirrored(scatterers.position_m[image]).T
+                along = scatterers.velocity_m_s[image] @ ground.normal
+                mirrored = scatterers.velocity_m_s[image] - 2.0 * along[:, None] * ground.normal
+                work.velocity[leg, :, :k][:, image] = mirrored.T
+        scale_m = float(self._scale[0])
+        filter_amplitudes(
+            *(k, work.points, scatterers.amplitude, self._centre_m, scale_m, self._offset_m, response, work.amplitude)
+        )
+        work.bend[:k] = 0.0
+        if scatterers.velocity_m_s.any():
+            away_m = work.points[1, :, :k] - self._centre_m[:, None]
+            range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
+            velocity = work.velocity[1, :, :k]
+            radial = (velocity * away_m).sum(axis=0) / range_m
+            work.bend[:k] = 0.5 * (np.square(velocity).sum(axis=0) - np.square(radial)) / range_m
+
+    def _synthesize(self, k: int, loop: int, moving: bool, jitter_s: Float64 | None) -> Complex64:
+        """Inverse FFT of one loop [chips, slots, cells, RX], sample i of the window at cell i - samples / 2."""
+        work, slots = self._work, self._layout.slots
+        time_s = (loop * slots + np.arange(slots)) * self._slot_s
+        middle_s = float(time_s.mean())
+        self._scale[2:] = 0.0 if jitter_s is None else jitter_s * self._jitter_turns_per_m_s
+        transmit_legs(
+            *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
+            *(self._scale, work.phasor, work.cell_out, work.base_out, work.reach_out),
+        )
+        first_s = float(time_s[0])
+        timing = np.array([middle_s, first_s, self._slot_s if moving else 0.0])
+        scale = np.array([self._scale[0], self._scale[1], self._offset_m])
+        receive_legs(
+            *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing, SHAPES[self.width], self.width),
+            *(work.legs, work.turn, work.cell_back, work.base_back, work.reach_back, self._scratch),
+        )
+        self._require_reach(k)
+        self._grid[:] = 0.0
+        for chip in range(len(self._receivers_m)):
+            for slot in range(slots):
+                self._spread(
+                    *(k, work.phasor[slot], work.cell_out[slot], work.cell_back[0, chip], work.cell_back[1, chip]),
+                    *(float(time_s[slot]) - middle_s, work.base_out, work.base_back, work.legs[chip].reshape(-1), self._margin),
+                    *(work.plan, work.start, self._grid[chip, slot].reshape(-1)),
+                )
+                if moving and slot + 1 < slots:
+                    turn_legs(k, work.legs[chip], work.turn[chip])
+        fold(self._grid.reshape(-1, *self._grid.shape[2:]), self._margin, self._cells)
+        spectrum = self._grid[:, :, self._margin :].view(np.complex64)
+        np.fft.ifft(spectrum, axis=2, norm="forward", out=self._lines)
+        return self._lines
+
+    def _require_reach(self, k: int) -> None:
+        """Refuse scatterers whose beat lies outside of what the receiver passes."""
+        work = self._work
+        nearest_m = 0.5 * (work.reach_out[0, :k] + work.reach_back[0, :k] - self._offset_m)
+        farthest_m = 0.5 * (work.reach_out[1, :k] + work.reach_back[1, :k] - self._offset_m)
+        bad = ~((nearest_m >= 0.0) & (farthest_m <= self.reach_m))
+        if bad.any():
+            index = int(np.argmax(bad))
+            place = ", ".join(f"{value:.3f}" for value in work.points[1, :, index])
+            raise RangeError(
+                f"{self.radar.radar} radar: scatterer {index} at ({place}) m lies outside of what the receiver passes",
+                value=float(farthest_m[index]),
+                allowed=f"half paths of 0 to {self.reach_m:.3f} m",
+                action="leave scatterers beyond Synthesizer.reach_m out",
+            )
+
+    def _correction(self) -> Float32:
+        """Inverse of the weights' Fourier transform at every sample."""
+        b = SHAPES[self.width]
+        index = np.arange(self._layout.samples) - self._layout.samples // 2
+        return np.asarray(np.sqrt(b / np.pi) * np.exp(np.square(np.pi * index / self._cells) / b), dtype=np.float32)
+
+    def frame(
+        self,
+        scatterers: Scatterers,
+        front_end: FrontEnd,
+        number: int,
+        t_first_chirp_ns: int,
+        ground: GroundPlane | None = None,
+        out: Int16 | None = None,
+    ) -> RadarFrame:
+        """Burst as the board would send it."""
+        raise NotImplementedError
