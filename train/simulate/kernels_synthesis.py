@@ -23,7 +23,9 @@ RX = 4
 """Receivers of one group."""
 LANES = 2 * RX
 """Floats of one grid row: I and Q of every receiver in turn."""
-LEG = 4 * LANES
+PAIR = 2 * LANES
+"""Floats of two neighbouring rows, which are written together: as many as one register of AVX-512 holds."""
+LEG = 4 * PAIR
 """Floats of one scatterer's receive leg: phasor, phasor times j, weight's exponent, weight's ratio."""
 BLOCK = 32
 """Scatterers of a block: distances are taken receiver by receiver over a block, so that they vectorise."""
@@ -117,13 +119,29 @@ def transmit_legs(  # type: ignore[no-untyped-def]
             reach[1, k] = path_m if m == 0 else max(reach[1, k], path_m)
 
 
+@njit(inline="always")
+def _write_leg(legs, o, n, work, i, next_level, next_ratio):  # type: ignore[no-untyped-def]
+    """Lanes of receiver n at ``legs[o]``: first for the group's lower, then for its upper cell."""
+    cosine, sine, exponent, ratio = work[0, n, i], work[1, n, i], work[2, n, i], work[3, n, i]
+    for _ in range(2):
+        legs[o + 2 * n], legs[o + 2 * n + 1] = cosine, sine
+        legs[o + PAIR + 2 * n], legs[o + PAIR + 2 * n + 1] = -sine, cosine
+        legs[o + 2 * PAIR + 2 * n], legs[o + 2 * PAIR + 2 * n + 1] = exponent, exponent
+        legs[o + 3 * PAIR + 2 * n], legs[o + 3 * PAIR + 2 * n + 1] = ratio, ratio
+        step = work[4, n, i] * next_level
+        cosine, sine = cosine * step, sine * step
+        exponent, ratio = work[5, n, i], ratio * next_ratio
+        o += LANES
+
+
 @njit(**OPTIONS)
 def receive_legs(  # type: ignore[no-untyped-def]
-    count, points, velocity, antennas, scale, timing, shape, width, legs, turn, cell, base, reach, work
+    count, points, velocity, antennas, scale, timing, shape, width, legs, turn, cell, base, reach, path, work
 ):
     """Receive phasors with their share of the weights, group by group, and how they turn from slot to slot.
 
-    A leg is its tangent at ``middle_s``; the transmit leg carries the common curvature.
+    A leg is its tangent at one instant; the transmit leg carries the common curvature. The weight of a cell is a
+    product of one factor of the scatterer, one of the receiver and one of both.
 
     Args:
         count: scatterers.
@@ -131,55 +149,67 @@ def receive_legs(  # type: ignore[no-untyped-def]
         antennas: float64 [chips, RX, 3].
         scale: cells and turns per metre, metres taken off the path: float64 [3].
         timing: instants of the tangent and of slot 0, time from slot to slot (0: nothing moves): float64 [3].
-        shape, width: of the weights exp(-shape distance^2), which reach ``width`` cells to either side.
-        legs: float32 [chips, capacity, LEG], overwritten: state at slot 0.
-        turn: float32 [chips, capacity, 2 * LANES], overwritten: cosine and sine of the turn per slot.
+        shape, width: of the weights exp(-shape distance^2); the first cell lies ``width`` below the nearest.
+        legs: float32 [chips, capacity * LEG], overwritten: state at slot 0.
+        turn: float32 [chips, capacity * 2 * PAIR], overwritten: cosine and sine of the turn per slot.
         cell: float32 [2, chips, capacity], overwritten: middle of the group's cells less ``base``, change per second.
         base: int32 [capacity], overwritten.
         reach: float64 [2, capacity], overwritten: shortest and longest leg.
-        work: float64 [2, RX, BLOCK], scratch: legs and their change per second.
+        path, work: float64 [2, RX, BLOCK] and float32 [6, RX, BLOCK], scratch.
     """
-    b, reach_cells = float32(shape), float32(width)
+    b, edge = float32(shape), float32(width)
     offset_m, middle_s, back_s, slot_s = scale[2], timing[0], timing[0] - timing[1], timing[2]
+    next_level, next_ratio = float32(math.exp(shape * (2.0 * width - 1.0))), float32(math.exp(-4.0 * shape))
     for first in range(0, count, BLOCK):
         size = min(BLOCK, count - first)
         for d in range(len(antennas)):
             for n in range(RX):
                 ax, ay, az = antennas[d, n, 0], antennas[d, n, 1], antennas[d, n, 2]
+                new = d == 0 and n == 0
                 for i in range(size):
                     k = first + i
                     x = points[0, k] + velocity[0, k] * middle_s - ax
                     y = points[1, k] + velocity[1, k] * middle_s - ay
                     z = points[2, k] + velocity[2, k] * middle_s - az
                     path_m = math.sqrt(x * x + y * y + z * z)
-                    work[0, n, i] = path_m
-                    work[1, n, i] = (x * velocity[0, k] + y * velocity[1, k] + z * velocity[2, k]) / path_m
-                    new = d == 0 and n == 0
+                    path[0, n, i] = path_m
+                    path[1, n, i] = (x * velocity[0, k] + y * velocity[1, k] + z * velocity[2, k]) / path_m
                     base[k] = int32(path_m * scale[0]) if new else base[k]
                     reach[0, k] = path_m if new else min(reach[0, k], path_m)
                     reach[1, k] = path_m if new else max(reach[1, k], path_m)
             for i in range(size):
-                k = first + i
-                mean_m = 0.25 * (work[0, 0, i] + work[0, 1, i] + work[0, 2, i] + work[0, 3, i])
-                mean_m_s = 0.25 * (work[1, 0, i] + work[1, 1, i] + work[1, 2, i] + work[1, 3, i])
-                cell[0, d, k] = float32((mean_m - offset_m) * scale[0] - base[k])
-                cell[1, d, k] = float32(mean_m_s * scale[0])
+                mean_m = 0.25 * (path[0, 0, i] + path[0, 1, i] + path[0, 2, i] + path[0, 3, i])
+                mean_m_s = 0.25 * (path[1, 0, i] + path[1, 1, i] + path[1, 2, i] + path[1, 3, i])
+                cell[0, d, first + i] = float32((mean_m - offset_m) * scale[0] - base[first + i])
+                cell[1, d, first + i] = float32(mean_m_s * scale[0])
                 for n in range(RX):
-                    away = float32((work[0, n, i] - mean_m) * scale[0])
-                    level = _exp(-b * away * (away + float32(2) * reach_cells))
-                    cosine, sine = _phasor((work[0, n, i] - work[1, n, i] * back_s - offset_m) * scale[1])
-                    cosine, sine = level * cosine, level * sine
-                    exponent = float32(-2) * b * away
-                    ratio = _exp(-exponent)
-                    legs[d, k, 2 * n], legs[d, k, 2 * n + 1] = cosine, sine
-                    legs[d, k, LANES + 2 * n], legs[d, k, LANES + 2 * n + 1] = -sine, cosine
-                    legs[d, k, 2 * LANES + 2 * n], legs[d, k, 2 * LANES + 2 * n + 1] = exponent, exponent
-                    legs[d, k, 3 * LANES + 2 * n], legs[d, k, 3 * LANES + 2 * n + 1] = ratio, ratio
-                if slot_s > 0.0:
-                    for n in range(RX):
-                        cosine, sine = _phasor(work[1, n, i] * slot_s * scale[1])
-                        turn[d, k, 2 * n], turn[d, k, 2 * n + 1] = cosine, cosine
-                        turn[d, k, LANES + 2 * n], turn[d, k, LANES + 2 * n + 1] = sine, sine
+                    work[2, n, i] = float32((path[0, n, i] - mean_m) * scale[0])
+            for n in range(RX):
+                for i in range(size):
+                    away = work[2, n, i]
+                    level = _exp(-b * away * (away + float32(2) * edge))
+                    cosine, sine = _phasor((path[0, n, i] - path[1, n, i] * back_s - offset_m) * scale[1])
+                    work[0, n, i], work[1, n, i] = level * cosine, level * sine
+                    rise = _exp(float32(2) * b * away)
+                    work[2, n, i], work[5, n, i] = float32(-2) * b * away, float32(-2) * b * (away - float32(1))
+                    work[3, n, i], work[4, n, i] = rise * rise, rise
+            for i in range(size):
+                for n in range(RX):
+                    _write_leg(legs[d], (first + i) * LEG, n, work, i, next_level, next_ratio)
+            if slot_s > 0.0:
+                _write_turns(turn[d], first, size, path, slot_s * scale[1])
+
+
+@njit(inline="always")
+def _write_turns(turn, first, size, path, turns_s_per_m):  # type: ignore[no-untyped-def]
+    """Cosines and sines of the turn per slot, in the order of the legs' lanes."""
+    for i in range(size):
+        o = (first + i) * 2 * PAIR
+        for n in range(RX):
+            cosine, sine = _phasor(path[1, n, i] * turns_s_per_m)
+            for lane in range(2 * n, PAIR, LANES):
+                turn[o + lane], turn[o + lane + 1] = cosine, cosine
+                turn[o + PAIR + lane], turn[o + PAIR + lane + 1] = sine, sine
 
 
 @njit(**OPTIONS)
@@ -188,33 +218,34 @@ def turn_legs(count, legs, turn):  # type: ignore[no-untyped-def]
 
     Args:
         count: scatterers.
-        legs: float32 [capacity, LEG], changed.
-        turn: float32 [capacity, 2 * LANES].
+        legs: float32 [capacity * LEG], changed.
+        turn: float32 [capacity * 2 * PAIR].
     """
-    for k in range(count):
-        for n in range(LANES):
-            value, by_j = legs[k, n], legs[k, LANES + n]
-            cosine, sine = turn[k, n], turn[k, LANES + n]
-            legs[k, n] = cosine * value + sine * by_j
-            legs[k, LANES + n] = cosine * by_j - sine * value
+    pair, leg, both = uint64(PAIR), uint64(LEG), uint64(2 * PAIR)
+    for k in range(uint64(count)):
+        for n in range(pair):
+            value, by_j = legs[k * leg + n], legs[k * leg + pair + n]
+            cosine, sine = turn[k * both + n], turn[k * both + pair + n]
+            legs[k * leg + n] = cosine * value + sine * by_j
+            legs[k * leg + pair + n] = cosine * by_j - sine * value
 
 
 @cache
 def spreader(width: int, shape: float) -> Callable[..., None]:
-    """Kernel that adds scatterers to one group's grid.
+    """Kernel that adds scatterers to one group's grid, two cells at a time.
 
     Args:
-        width: cells reached to either side of the nearest.
+        width: the first of 2 width + 2 cells lies this far below the nearest.
         shape: of the weights exp(-shape distance^2).
     Returns:
         Kernel of (count, phasor [2, capacity], cell_out [capacity], cell_back [capacity], drift [capacity], time_s,
         base_out, base_back int32 [capacity], legs [capacity * LEG], margin, plan float32 [4, capacity], start int32
         [capacity], grid float32 [rows * LANES]).
     """
-    cells = np.uint64(2 * width + 1)
-    lanes, two, three = (np.uint64(part * LANES) for part in (1, 2, 3))
+    steps, lanes = np.uint64(width + 1), np.uint64(PAIR)
+    two, three, leg_size = np.uint64(2 * PAIR), np.uint64(3 * PAIR), np.uint64(LEG)
     b, edge = np.float32(shape), np.float32(math.exp(-shape * width * width))
-    first_ratio, bend = np.float32(math.exp(shape * (2 * width - 1))), np.float32(math.exp(-2 * shape))
+    first_ratio, bend = np.float32(math.exp(4.0 * shape * (width - 1))), np.float32(math.exp(-8.0 * shape))
 
     @njit(**OPTIONS)
     def spread(  # type: ignore[no-untyped-def]
@@ -226,23 +257,20 @@ def spreader(width: int, shape: float) -> Callable[..., None]:
             nearest = np.floor(place + float32(0.5))
             away = place - nearest
             start[k] = (base_out[k] + base_back[k] + int32(nearest) + margin - width) * LANES
-            falling = _exp(float32(-2) * b * away)
+            falling, rising = _exp(float32(-2) * b * away), _exp(float32(2) * b * away)
             level = edge * _exp(-b * away * away)
             for _ in range(width):
                 level *= falling
             plan[0, k] = away
-            plan[1, k] = phasor[0, k] * level
-            plan[2, k] = phasor[1, k] * level
-            plan[3, k] = first_ratio * _exp(float32(2) * b * away)
+            plan[1, k], plan[2, k] = phasor[0, k] * level, phasor[1, k] * level
+            plan[3, k] = first_ratio * rising * rising
         for k in range(count):
             away, re, im, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
-            o, leg = uint64(start[k]), uint64(k * LEG)
+            o, leg = uint64(start[k]), uint64(k) * leg_size
             for n in range(lanes):
-                y = away * legs[leg + two + n]
-                level = float32(1) + y * (float32(1) + y * (float32(0.5) + y * (float32(1 / 6) + y * float32(1 / 24))))
-                value = (re * legs[leg + n] + im * legs[leg + lanes + n]) * level
+                value = (re * legs[leg + n] + im * legs[leg + lanes + n]) * _exp(away * legs[leg + two + n])
                 step = ratio * legs[leg + three + n]
-                for j in range(cells):
+                for j in range(steps):
                     grid[o + lanes * j + n] += value
                     value *= step
                     step *= bend

@@ -23,6 +23,7 @@ from train.simulate.kernels_synthesis import (
     BLOCK,
     LANES,
     LEG,
+    PAIR,
     RX,
     filter_amplitudes,
     fold,
@@ -84,8 +85,8 @@ class _Work:
             cell_out=np.zeros((slots, room), f4),
             base_out=np.zeros(room, np.int32),
             reach_out=np.zeros((2, room), f8),
-            legs=np.zeros((chips, room, LEG), f4),
-            turn=np.zeros((chips, room, 2 * LANES), f4),
+            legs=np.zeros((chips, room * LEG), f4),
+            turn=np.zeros((chips, room * 2 * PAIR), f4),
             cell_back=np.zeros((2, chips, room), f4),
             base_back=np.zeros(room, np.int32),
             reach_back=np.zeros((2, room), f8),
@@ -135,7 +136,8 @@ class Synthesizer:
         self.correction = self._correction()
         """float32 [samples]: takes the weights' own spectrum out of the inverse FFT."""
         self._no_filter = np.ones(self._cells + 1, dtype=np.complex64)
-        self._scratch = np.zeros((2, RX, BLOCK))
+        self._path = np.zeros((2, RX, BLOCK))
+        self._scratch = np.zeros((6, RX, BLOCK), dtype=np.float32)
         self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
         self._beat: Complex64 | None = None
 
@@ -213,7 +215,7 @@ class Synthesizer:
         scale = np.array([self._scale[0], self._scale[1], self._offset_m])
         receive_legs(
             *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing, SHAPES[self.width], self.width),
-            *(work.legs, work.turn, work.cell_back, work.base_back, work.reach_back, self._scratch),
+            *(work.legs, work.turn, work.cell_back, work.base_back, work.reach_back, self._path, self._scratch),
         )
         self._require_reach(k)
         self._grid[:] = 0.0
@@ -221,7 +223,7 @@ class Synthesizer:
             for slot in range(slots):
                 self._spread(
                     *(k, work.phasor[slot], work.cell_out[slot], work.cell_back[0, chip], work.cell_back[1, chip]),
-                    *(float(time_s[slot]) - middle_s, work.base_out, work.base_back, work.legs[chip].reshape(-1), self._margin),
+                    *(float(time_s[slot]) - middle_s, work.base_out, work.base_back, work.legs[chip], self._margin),
                     *(work.plan, work.start, self._grid[chip, slot].reshape(-1)),
                 )
                 if moving and slot + 1 < slots:
