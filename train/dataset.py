@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -19,6 +20,7 @@ from train.objects.human import HumanModel
 from train.objects.library import PROCEDURAL, SPLITS, Entry, Split, default_objects_dir, read_manifest
 from train.objects.mesh import CLASSES, ClassName, Mesh, MeshError
 from train.objects.parametric import generate
+from train.objects.reference import RIDDEN, ObjectRef
 from train.objects.sampling import sample_surface
 from train.perturb import AZIMUTH_SECTORS, PerturbSettings, perturb
 
@@ -29,6 +31,8 @@ _ORIGINS: tuple[Origin, ...] = ("collected", "procedural", "parametric")
 _EVALUATION_PARAMETRIC = 12
 """Parametric objects of a class in val and test when the library holds no collected one."""
 _ATTEMPTS = 16
+_RIDERS = 4
+"""Different riders of a library two-wheeler."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,7 @@ class DatasetSettings:
         origin_share: chance of a collected, a procedural (library) and an own parametric object in train, by class;
             shares of an origin that has no object go to the others.
         parametric_objects: how many different parametric objects of a class there are in train.
+        rider_share: chance of a rider on a two-wheeler of the library in train (parametric ones have their own draw).
     Raises:
         ConfigError: a number outside its range.
     """
@@ -96,6 +101,7 @@ class DatasetSettings:
         }
     )
     parametric_objects: int = 256
+    rider_share: float = 0.5
 
     def __post_init__(self) -> None:
         require(1 <= self.min_points <= self.max_points, "dataset.min_points", self.min_points, "1..max_points")
@@ -106,6 +112,7 @@ class DatasetSettings:
         require(self.epoch_samples >= 1, "dataset.epoch_samples", self.epoch_samples, ">= 1")
         require(self.evaluation_views >= 1, "dataset.evaluation_views", self.evaluation_views, ">= 1")
         require(self.parametric_objects >= 1, "dataset.parametric_objects", self.parametric_objects, ">= 1")
+        require(0 <= self.rider_share <= 1, "dataset.rider_share", self.rider_share, "0..1")
         require(set(self.origin_share) == set(CLASSES), "dataset.origin_share", set(self.origin_share), str(CLASSES))
 
     @classmethod
@@ -165,6 +172,21 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         """Names of the library's objects that this split draws from."""
         return [entry.object_id for entries in self._library.values() for entry in entries]
 
+    @property
+    def description(self) -> dict[str, object]:
+        """What decides the samples: a run can only be continued where all of this is the same."""
+        names = "\n".join(sorted(self.object_ids))
+        return {
+            "library_objects": len(self.object_ids),
+            "library_sha256": hashlib.sha256(names.encode()).hexdigest(),
+            "seed": self.seed,
+            "truth_points": self.settings.truth_points,
+            "max_points": self.settings.max_points,
+            "box_frame": self.settings.box_frame,
+            "sight_sigma_deg": self.settings.sight_sigma_deg,
+            "ground_sigma_m": self.settings.ground_sigma_m,
+        }
+
     def mesh(self, index: int) -> Mesh:
         """The complete object of a sample, before yaw and shift."""
         return self._mesh(index, self._generator(index))
@@ -222,10 +244,13 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         if origin == "parametric":
             number = int(rng.integers(self.settings.parametric_objects))
             human = self._human if CLASSES[label] == "pedestrian" and number % 5 else None
-            mesh = _person(human, number) if human else _parametric(label, number, self.split)
+            mesh = _person(human, len(SPLITS) * number) if human else _parametric(label, number, self.split)
         else:
             entries = self._library[label, origin]
-            mesh = _load(entries[rng.integers(len(entries))])
+            entry = entries[rng.integers(len(entries))]
+            ridden = CLASSES[label] in RIDDEN and rng.random() < self.settings.rider_share
+            number = int(rng.integers(_RIDERS)) if ridden else 0
+            mesh = _ridden(entry, self.settings.objects_dir, bool(self._human), number) if ridden else _load(entry)
         return vary(mesh, self.settings.deformation, rng)
 
 
@@ -238,6 +263,16 @@ def _spread(points: Float32) -> float:
 def _load(entry: Entry) -> Mesh:
     """A library mesh, kept in memory (the whole library is about 50 MB)."""
     return entry.load()
+
+
+@lru_cache(maxsize=256)
+def _ridden(entry: Entry, objects_dir: Path | None, human: bool, number: int) -> Mesh:
+    """A library two-wheeler with a rider, without where nothing on it looks like a saddle and a bar (0.4 MB each)."""
+    ref = ObjectRef(CLASSES[entry.label], entry.name, rider=f"{'human' if human else 'rider'}{number}")
+    try:
+        return ref.mesh(objects_dir)
+    except MeshError:
+        return _load(entry)
 
 
 @lru_cache(maxsize=2048)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import signal
@@ -156,20 +155,7 @@ class Trainer:
 
     def _description(self) -> dict[str, Any]:
         """Settings, and what the data were drawn from."""
-        data = self.train.settings
-        names = "\n".join(sorted(self.train.object_ids))
-        return asdict(self.settings) | {
-            "data": {
-                "library_objects": len(self.train.object_ids),
-                "library_sha256": hashlib.sha256(names.encode()).hexdigest(),
-                "seed": self.train.seed,
-                "truth_points": data.truth_points,
-                "max_points": data.max_points,
-                "box_frame": data.box_frame,
-                "sight_sigma_deg": data.sight_sigma_deg,
-                "ground_sigma_m": data.ground_sigma_m,
-            }
-        }
+        return asdict(self.settings) | {"data": self.train.description}
 
     def _check_settings(self) -> None:
         now = self._description()
