@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from train.objects.human import HumanModel, _align, _build
+from train.objects.human import HumanModel, align, build
 from train.objects.mesh import MeshError
 
 
@@ -44,7 +44,7 @@ def test_without_turns_the_body_stays(model: HumanModel) -> None:
 
 def test_turning_a_limb_moves_only_what_hangs_on_it(model: HumanModel) -> None:
     heads = model.heads(model.neutral)
-    turn = _align(np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    turn = align(np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
     bent = model.bend(model.neutral, heads, {"calf_l": turn})
     moved = np.linalg.norm(bent - model.neutral, axis=1) > 0.1
     hanging = model.weights[:, [model.bones.index(b) for b in ("calf_l", "foot_l", "ball_l")]].sum(axis=1)
@@ -57,9 +57,9 @@ def test_turning_a_limb_moves_only_what_hangs_on_it(model: HumanModel) -> None:
     )
 
 
-def test_weights_of_ages_and_builds_are_shares() -> None:
+def test_weights_of_ages_andbuilds_are_shares() -> None:
     for seed in range(50):
-        values = _build(np.random.default_rng(seed))
+        values = build(np.random.default_rng(seed))
         assert values["male"] + values["female"] == 1
         assert sum(values[a] for a in ("african", "asian", "caucasian")) == pytest.approx(1)
         assert sum(values.get(a, 0) for a in ("baby", "child", "young", "old")) == pytest.approx(1)
@@ -67,11 +67,11 @@ def test_weights_of_ages_and_builds_are_shares() -> None:
             assert sum(values[k + name] for k in ("min", "average", "max")) == pytest.approx(1)
 
 
-def test_align_is_a_rotation() -> None:
+def testalign_is_a_rotation() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         a, b = rng.normal(size=(2, 3))
-        turn = _align(a, b)
+        turn = align(a, b)
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
         np.testing.assert_allclose(turn @ a / np.linalg.norm(a), b / np.linalg.norm(b), atol=1e-9)
 

@@ -17,7 +17,7 @@ from train.objects.mesh import CLASSES, Mesh, MeshError, stand
 from train.objects.parametric_person import gait, swing
 from train.objects.sampling import Int32
 
-_WORLD = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]) / 10
+WORLD = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]) / 10
 """The file has decimetres, x left, y up, z forward; here metres, x forward, y left, z up."""
 HUMAN_ORIGIN = ("makehuman", "CC0-1.0", "MakeHuman community (not required)")
 """Source group, licence and attribution of every person made here."""
@@ -92,11 +92,11 @@ class HumanModel:
         """Head of every bone, float64 [bones, 3]."""
         return np.stack([body[vertices].mean(axis=0) for vertices in self.joints])
 
-    def bend(self, body: Float64, heads: Float64, turns: dict[str, Float64]) -> Float64:
-        """Linear blend skinning.
+    def chain(self, heads: Float64, turns: dict[str, Float64]) -> tuple[Float64, Float64]:
+        """Rotation [bones, 3, 3] and new head [bones, 3] of every bone.
 
         Args:
-            body: [n, 3]; heads: [bones, 3].
+            heads: [bones, 3].
             turns: bone -> its rotation [3, 3] in the world; a bone without one follows its parent.
         """
         rotation = np.empty((len(self.bones), 3, 3))
@@ -106,6 +106,11 @@ class HumanModel:
             rotation[number] = turns.get(bone, inherited)
             anchor = moved[parent] + inherited @ (heads[number] - heads[parent]) if parent >= 0 else heads[number]
             moved[number] = anchor
+        return rotation, moved
+
+    def bend(self, body: Float64, heads: Float64, turns: dict[str, Float64]) -> Float64:
+        """Linear blend skinning of a body [n, 3]; heads and turns as in ``chain``."""
+        rotation, moved = self.chain(heads, turns)
         shift = moved - np.einsum("bij,bj->bi", rotation, heads)
         blended = (self.weights @ rotation.reshape(-1, 9)).reshape(-1, 3, 3)
         bent: Float64 = np.einsum("nij,nj->ni", blended, body) + self.weights @ shift
@@ -116,13 +121,13 @@ class HumanModel:
     def person(self, seed: int) -> Mesh:
         """A random person, on the ground, centred; 70 % walk."""
         rng = np.random.default_rng([CLASSES.index("pedestrian"), seed])
-        body = self.shape(_build(rng)) @ _WORLD.T
+        body = self.shape(build(rng)) @ WORLD.T
         heads = self.heads(body)
         walking = rng.random() < 0.7
         amplitude = rng.uniform(0.75, 1.15) if walking else rng.uniform(0.0, 0.25)
         posed = self.bend(body, heads, self._turns(heads, rng.random(), amplitude, rng))
-        posed = posed + self._clothes(posed, rng)
-        used, faces = _compact(self.faces)
+        posed = posed + self.clothes(posed, rng)
+        used, faces = compact(self.faces)
         vertices = posed[used]
         if np.ptp(vertices[:, 2]) > 1.5:  # an adult: stature of the population
             stature = rng.normal(1.70, 0.09)
@@ -138,8 +143,8 @@ class HumanModel:
         yaw = math.radians(6) * amplitude * math.cos(2 * math.pi * phase)
         elbow = math.radians(rng.uniform(18, 28)) * (0.4 + 0.6 * amplitude)
         splay = math.radians(rng.uniform(6, 14))
-        turns = {"pelvis": _about_z(-yaw), "spine_01": _about_z(0.2 * yaw), "spine_03": _about_z(1.5 * yaw)}
-        turns |= {"spine_02": _about_z(0.8 * yaw), "neck_01": np.eye(3)}
+        turns = {"pelvis": about_z(-yaw), "spine_01": about_z(0.2 * yaw), "spine_03": about_z(1.5 * yaw)}
+        turns |= {"spine_02": about_z(0.8 * yaw), "neck_01": np.eye(3)}
         for side, sign, offset in (("_l", 1.0, 0.0), ("_r", -1.0, 0.5)):
             angles = gait(phase + offset, amplitude)
             chain = {
@@ -149,11 +154,11 @@ class HumanModel:
                 "lowerarm": ("hand", swing(angles.upper_arm + elbow, 0.5 * splay * sign)),
             }
             for bone, (following, direction) in chain.items():
-                turns[bone + side] = _align(at[following + side] - at[bone + side], direction)
-            turns["foot" + side] = _about_y(-angles.foot)
+                turns[bone + side] = align(at[following + side] - at[bone + side], direction)
+            turns["foot" + side] = about_y(-angles.foot)
         return turns
 
-    def _clothes(self, posed: Float64, rng: np.random.Generator) -> Float64:
+    def clothes(self, posed: Float64, rng: np.random.Generator) -> Float64:
         """Displacement along the normals: torso and arms 0.4-2.8 cm, legs 0.4-2.2 cm, none on head, hands and feet."""
         thick = {"torso": rng.uniform(0.004, 0.028), "leg": rng.uniform(0.004, 0.022)}
         of_bone = np.array([thick.get(_CLOTHED.get(bone.split("_")[0], ""), 0.0) for bone in self.bones])
@@ -168,17 +173,19 @@ class HumanModel:
         return total * thickness[:, None]
 
 
-def _compact(faces: Int32) -> tuple[NDArray[np.int32], Int32]:
+def compact(faces: Int32) -> tuple[NDArray[np.int32], Int32]:
     """Vertices in use, and the faces renumbered to them."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return used, renumbered.reshape(-1, 3).astype(np.int32)
 
 
-def _build(rng: np.random.Generator) -> dict[str, float]:
-    """Values of the factors: gender, age (15 % children, 15 % old), muscle, weight, height, ancestry."""
+def build(rng: np.random.Generator, age: float | None = None) -> dict[str, float]:
+    """Values of the factors: gender, age (None: 15 % children, 15 % old), muscle, weight, height, ancestry."""
     gender = float(rng.random() < 0.5)
     kind = rng.random()
-    age = rng.uniform(0.08, 0.28) if kind < 0.15 else rng.uniform(0.75, 1.0) if kind < 0.30 else rng.uniform(0.4, 0.75)
+    low, high = (0.08, 0.28) if kind < 0.15 else (0.75, 1.0) if kind < 0.30 else (0.4, 0.75)
+    drawn = rng.uniform(low, high)
+    age = drawn if age is None else age
     values = {"male": gender, "female": 1 - gender, "universal": 1.0}
     if age < 0.5:
         young = max(0.0, (age - 0.1875) * 3.2)
@@ -199,7 +206,7 @@ def _build(rng: np.random.Generator) -> dict[str, float]:
     return values | dict(zip(("african", "asian", "caucasian"), rng.dirichlet((1, 1, 1)).tolist(), strict=True))
 
 
-def _align(before: Float64, after: Float64) -> Float64:
+def align(before: Float64, after: Float64) -> Float64:
     """Smallest rotation [3, 3] that turns the direction ``before`` into ``after``."""
     a, b = before / np.linalg.norm(before), after / np.linalg.norm(after)
     x, y, z = np.cross(a, b)
@@ -208,11 +215,13 @@ def _align(before: Float64, after: Float64) -> Float64:
     return turn
 
 
-def _about_z(angle: float) -> Float64:
+def about_z(angle: float) -> Float64:
+    """Rotation [3, 3] from x towards y, radians."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-def _about_y(angle: float) -> Float64:
+def about_y(angle: float) -> Float64:
+    """Rotation [3, 3] from z towards x (a nod forward), radians."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bicycles from tubes and tyres to true scale, with and without a rider."""
+"""Bicycles from tubes and tyres to true scale, and where a rider touches them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.frames import Float64
-from train.objects.parametric_person import random_body, rider
 from train.objects.primitives import Part, box, curve, lathe, mirrored, superellipsoid, torus, tube, vec
+from train.objects.rider import Contacts
 
-RIDER_PROBABILITY = 0.3
 _KINDS = ("city", "road", "mountain", "stepthrough", "kids", "folding")
 _WHEEL = {"city": (0.33, 0.35), "road": (0.33, 0.345), "mountain": (0.33, 0.37), "stepthrough": (0.33, 0.35),
           "kids": (0.22, 0.28), "folding": (0.20, 0.24)}  # fmt: skip
@@ -108,18 +107,18 @@ def _bars(kind: str, stem: Float64, rng: np.random.Generator) -> tuple[list[Part
 
 
 def _cranks(frame: BicycleFrame, angle: float) -> tuple[list[Part], Float64]:
-    """Chain ring, both cranks and pedals; returns the ankles above the pedals [2, 3] too."""
+    """Chain ring, both cranks and pedals; returns the upper sides of the pedals [2, 3] too."""
     bottom = frame.bottom
     ring = lathe(bottom + vec(0, -0.045, 0), [(0.02, 0), (0.09, 0.004), (0.09, -0.004), (0.02, -0.004)], 20)
-    parts, ankles = [ring], []
+    parts, treads = [ring], []
     for sign in (1.0, -1.0):
         out = 0.17 * sign * np.array([math.cos(angle), 0, math.sin(angle)])
         start = bottom + vec(0, 0.055 * sign, 0)
         end = start + out + vec(0, 0.02 * sign, 0)
         parts.append(tube([start, end], 0.012, 6))
         parts.append(box(end + vec(0, 0.055 * sign, 0), (0.09, 0.09, 0.025)))
-        ankles.append(end + vec(-0.09, 0.05 * sign, 0.10))
-    return parts, np.stack(ankles)
+        treads.append(end + vec(0, 0.055 * sign, 0.0125))
+    return parts, np.stack(treads)
 
 
 def _tubes(kind: str, frame: BicycleFrame, rng: np.random.Generator) -> list[Part]:
@@ -174,8 +173,8 @@ def _extras(kind: str, frame: BicycleFrame, wheel: float, rng: np.random.Generat
     return parts
 
 
-def bicycle(rng: np.random.Generator) -> list[Part]:
-    """A random bicycle; x forward, ground z = 0, not centred."""
+def bicycle(rng: np.random.Generator) -> tuple[list[Part], Contacts]:
+    """A random bicycle and the places of its rider; x forward, ground z = 0, not centred."""
     kind = str(rng.choice(_KINDS, p=[0.3, 0.2, 0.2, 0.12, 0.1, 0.08]))
     wheel = float(rng.uniform(*_WHEEL[kind]))
     frame = draw_frame(kind, wheel, rng)
@@ -187,17 +186,15 @@ def bicycle(rng: np.random.Generator) -> list[Part]:
     turn = _about(axis, steering)
     turned = [((v - frame.head_low) @ turn.T + frame.head_low, f) for v, f in front]
     grips = (grips - frame.head_low) @ turn.T + frame.head_low
-    cranks, ankles = _cranks(frame, rng.uniform(0, 2 * math.pi))
+    cranks, treads = _cranks(frame, rng.uniform(0, 2 * math.pi))
     saddle = [
         superellipsoid(frame.saddle - vec(0.04, 0, 0), (0.10, 0.075, 0.03), (0.8, 0.9), steps=(12, 7)),
         superellipsoid(frame.saddle + vec(0.07, 0, 0), (0.10, 0.025, 0.025), (0.8, 0.9), steps=(10, 7)),
     ]
     parts = _wheel(frame.rear, wheel, tyre) + turned + _tubes(kind, frame, rng) + cranks + saddle
     parts += _extras(kind, frame, wheel, rng)
-    if kind != "kids" and rng.random() < RIDER_PROBABILITY:
-        lean = math.radians(rng.uniform(38, 52) if kind == "road" else rng.uniform(12, 30))
-        parts += rider(random_body(rng, adult=True), frame.saddle, grips, ankles, lean)
-    return parts
+    reach = rng.uniform(0.86, 0.93) if kind == "road" else rng.uniform(0.88, 0.97)
+    return parts, Contacts(frame.saddle + vec(-0.04, 0, 0.03), grips, treads, True, float(reach))
 
 
 def _about(axis: Float64, angle_rad: float) -> Float64:

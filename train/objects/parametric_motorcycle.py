@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motorcycles and scooters from lofted bodies to true scale, with and without a rider."""
+"""Motorcycles and scooters from lofted bodies to true scale, and where a rider touches them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.frames import Float64
-from train.objects.parametric_person import random_body, rider
 from train.objects.primitives import (
     Part,
     box,
@@ -24,8 +23,8 @@ from train.objects.primitives import (
     tube,
     vec,
 )
+from train.objects.rider import Contacts
 
-RIDER_PROBABILITY = 0.3
 _KINDS = ("naked", "sport", "cruiser", "enduro", "touring", "scooter")
 
 
@@ -36,7 +35,8 @@ class Machine:
     Args:
         wheelbase, front_radius, rear_radius, front_tyre, rear_tyre: wheels, outer radius and half the tyre's width.
         seat_height, bar_height, bar_half: rider's contact points. rake_rad: steering head from the vertical.
-        foot: ankle of the rider, forward of the rear axle and above ground. lean_rad: trunk of the rider.
+        foot: pegs or floor, forward of the rear axle, to the side and above ground.
+        reach: share of the rider's arm from the shoulders to the grips.
     """
 
     kind: str
@@ -49,8 +49,8 @@ class Machine:
     bar_height: float
     bar_half: float
     rake_rad: float
-    foot: tuple[float, float]
-    lean_rad: float
+    foot: tuple[float, float, float]
+    reach: float
 
 
 def draw_machine(kind: str, rng: np.random.Generator) -> Machine:
@@ -85,7 +85,7 @@ def draw_machine(kind: str, rng: np.random.Generator) -> Machine:
     }[kind]
     scooter = kind == "scooter"
     wheelbase = pick(*base)
-    foot = {"cruiser": 0.62, "sport": 0.30, "scooter": 0.62}.get(kind, 0.45) * wheelbase
+    foot = {"cruiser": 0.69, "sport": 0.37, "scooter": 0.56}.get(kind, 0.50) * wheelbase
     return Machine(
         kind=kind,
         wheelbase=wheelbase,
@@ -97,8 +97,8 @@ def draw_machine(kind: str, rng: np.random.Generator) -> Machine:
         bar_height=pick(*bar),
         bar_half=pick(0.31, 0.35) if kind in ("sport", "scooter") else pick(0.36, 0.42),
         rake_rad=math.radians(pick(30, 36) if kind == "cruiser" else pick(23, 28)),
-        foot=(foot, 0.42 if kind in ("sport", "scooter") else 0.36),
-        lean_rad=math.radians({"sport": 45, "naked": 22}.get(kind, 4) + pick(-4, 8)),
+        foot=(foot, 0.12, 0.35) if scooter else (foot, 0.21, 0.36 if kind == "sport" else 0.30),
+        reach=pick(0.82, 0.95),
     )
 
 
@@ -282,8 +282,8 @@ def _scooter_body(m: Machine, stem: Float64, rng: np.random.Generator) -> list[P
     return parts
 
 
-def motorcycle(rng: np.random.Generator) -> list[Part]:
-    """A random machine; x forward, ground z = 0, not centred."""
+def motorcycle(rng: np.random.Generator) -> tuple[list[Part], Contacts]:
+    """A random machine and the places of its rider; x forward, ground z = 0, not centred."""
     kind = str(rng.choice(_KINDS, p=[0.22, 0.15, 0.15, 0.1, 0.13, 0.25]))
     m = draw_machine(kind, rng)
     axle = np.array([m.wheelbase, 0, m.front_radius])
@@ -296,8 +296,10 @@ def motorcycle(rng: np.random.Generator) -> list[Part]:
     parts += _scooter_body(m, stem, rng) if kind == "scooter" else _motorcycle_body(m, stem, rng)
     if kind != "scooter":
         parts.append(box((-0.22, 0, 0.6 * m.seat_height), (0.04, 0.16, 0.16)))
-    if rng.random() < RIDER_PROBABILITY:
-        seat = np.array([0.34 * m.wheelbase, 0, m.seat_height])
-        ankles = np.array([[m.foot[0], 0.17, m.foot[1]], [m.foot[0], -0.17, m.foot[1]]])
-        parts += rider(random_body(rng, adult=True), seat, grips, ankles, m.lean_rad)
-    return parts
+    forward, side, height = m.foot
+    if kind != "scooter":
+        peg = tube([vec(forward, side - 0.09, height - 0.012), vec(forward, side + 0.04, height - 0.012)], 0.012, 6)
+        parts += [peg, mirrored(peg)]
+    feet = np.array([[forward, side, height], [forward, -side, height]])
+    saddle = vec((0.27 if kind == "scooter" else 0.33) * m.wheelbase, 0, m.seat_height)
+    return parts, Contacts(saddle, grips, feet, False, m.reach)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People from capsules and superellipsoids: standing, walking at any phase of the gait, or riding."""
+"""People from capsules and superellipsoids: standing or walking at any phase of the gait."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from train.objects.primitives import Part, capsule, superellipsoid
 _HIP = ((0, 28), (15, 24), (30, 10), (50, -10), (62, -2), (75, 22), (87, 32), (100, 28))
 _KNEE = ((0, 4), (12, 17), (30, 7), (40, 4), (50, 10), (62, 38), (72, 60), (85, 32), (95, 5), (100, 4))
 _ANKLE = ((0, 0), (7, -7), (30, 6), (45, 11), (52, 5), (63, -17), (75, 0), (100, 0))
+
+TRUNK = slice(12, 14)
+"""Chest and belly among the parts of ``flesh``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,27 +193,3 @@ def pedestrian(rng: np.random.Generator) -> list[Part]:
     if rng.random() < 0.7:
         return walking(body, rng.random(), rng.uniform(0.75, 1.15), rng)
     return walking(body, rng.random(), rng.uniform(0.0, 0.25), rng)
-
-
-def rider(body: Body, seat: ArrayLike, grips: ArrayLike, feet: ArrayLike, lean_rad: float) -> list[Part]:
-    """A person on a two-wheeler.
-
-    Args:
-        body: sizes.
-        seat: [3], top of the saddle.
-        grips: [2, 3], left and right hand.
-        feet: [2, 3], left and right ankle.
-        lean_rad: of the trunk forward from upright.
-    """
-    pelvis = np.asarray(seat, dtype=float) + np.array([0, 0, 0.05 * body.stature])
-    up = np.array([math.sin(lean_rad), 0, math.cos(lean_rad)])
-    joints = {"pelvis": pelvis, "neck": pelvis + up * (body.torso + 0.03 * body.stature)}
-    for number, (side, sign) in enumerate((("l", 1.0), ("r", -1.0))):
-        out = np.array([0, sign, 0])
-        hip = pelvis + body.hip * out
-        knee, ankle = two_link(hip, np.asarray(feet)[number], body.thigh, body.shank, [1, 0.15 * sign, 0.4])
-        shoulder = pelvis + body.torso * up + body.shoulder * out
-        elbow, hand = two_link(shoulder, np.asarray(grips)[number], body.upper_arm, body.forearm, [-0.3, sign, -0.8])
-        joints |= {side + "hip": hip, side + "knee": knee, side + "ankle": ankle}
-        joints |= {side + "shoulder": shoulder, side + "elbow": elbow, side + "hand": hand}
-    return flesh(body, joints)
