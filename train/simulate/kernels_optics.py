@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of physical optics: what patches and points send back to an eye, and which of it is worth keeping."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from edge.frames import Complex64, Float32, Float64
+from train.objects.sampling import Int32
+
+UInt8 = NDArray[np.uint8]
+Int8 = NDArray[np.int8]
+
+DIRECT, MIXED, GROUND = 0, 1, 2
+"""Path classes: both legs direct; one of them by way of the ground (two channels of equal weight); both."""
+SEEN, SEEN_IN_GROUND = 1, 2
+"""Bits of the visibility of a point: from the radar, from its image below the ground."""
+SERIES_BELOW = 0.02
+"""q^2 A below which the triangle's integral is its series to second order (error below 1e-5)."""
+CURVED_FROM = 0.02
+"""Variance of the normal over the lobe's own width^2 from which a patch counts as curved."""
+LOBE = 0.038
+"""w^2 = LOBE lambda^2 / A: variance of the Gaussian with the curvature of a square facet's lobe at its peak."""
+MOST_EXPONENT = 10.0
+"""Exponent of a curved patch's lobe beyond which it sends nothing (-87 dB)."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def triangle_integral(qx: float, qy: float, qz: float, shape: Float32) -> complex:  # pragma: no cover - compiled
+    """Integral of exp(j q . r) over a flat triangle, r from its centre; m^2.
+
+    Args:
+        qx, qy, qz: wave vector, rad/m; only its part in the triangle's plane matters.
+        shape: [4, 3], centre (not used), unit normal and the two sides from the first corner, metres.
+    Source: Gordon, "Far-field approximations to the Kirchhoff-Helmholtz representations of scattered fields", IEEE
+        Trans. Antennas Propag. 23(4), 1975: the theorem of Green turns the area into a sum over the three sides.
+    """
+    nx, ny, nz = np.float64(shape[1, 0]), np.float64(shape[1, 1]), np.float64(shape[1, 2])
+    ux, uy, uz = np.float64(shape[2, 0]), np.float64(shape[2, 1]), np.float64(shape[2, 2])
+    vx, vy, vz = np.float64(shape[3, 0]), np.float64(shape[3, 1]), np.float64(shape[3, 2])
+    normal = qx * nx + qy * ny + qz * nz
+    plane = qx * qx + qy * qy + qz * qz - normal * normal
+    a, b = qx * ux + qy * uy + qz * uz, qx * vx + qy * vy + qz * vz
+    area = 0.5 * (nx * (uy * vz - uz * vy) + ny * (uz * vx - ux * vz) + nz * (ux * vy - uy * vx))
+    first = -(a + b) / 3.0
+    second, third = first + a, first + b
+    if plane * area < SERIES_BELOW:
+        return complex(area * (1.0 - (first * first + second * second + third * third) / 24.0), 0.0)
+    # Sides i -> j in the sense of the normal: weight q . (l x n), phase at the middle, half the phase along it.
+    tx, ty, tz = ny * qz - nz * qy, nz * qx - nx * qz, nx * qy - ny * qx
+    g_first = ux * tx + uy * ty + uz * tz
+    g_third = -(vx * tx + vy * ty + vz * tz)
+    g_second = -(g_first + g_third)
+    s1, s2, s3 = g_first * _sinc(0.5 * a), g_second * _sinc(0.5 * (b - a)), g_third * _sinc(0.5 * b)
+    p1, p2, p3 = 0.5 * (first + second), 0.5 * (second + third), 0.5 * (third + first)
+    real = s1 * math.cos(p1) + s2 * math.cos(p2) + s3 * math.cos(p3)
+    imaginary = s1 * math.sin(p1) + s2 * math.sin(p2) + s3 * math.sin(p3)
+    return complex(imaginary / plane, -real / plane)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sinc(x: float) -> float:  # pragma: no cover - compiled
+    """sin(x) / x."""
+    return 1.0 - x * x / 6.0 if abs(x) < 1e-3 else math.sin(x) / x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fade(x: float) -> float:  # pragma: no cover - compiled
+    """1 up to x = 0.5, smoothly to 0 at x = 1."""
+    t = 2.0 * (1.0 - x)
+    return 1.0 if t >= 1.0 else t * t * (3.0 - 2.0 * t)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+def lobe_candidates(
+    facing: Float32, eye: Float64, slack_rad: float, mark: UInt8, index: Int32
+) -> int:  # pragma: no cover - compiled
+    """Patches whose lobes may reach the radar from anywhere near a place; returns how many.
+
+    Args:
+        facing: float32 [p, 7], centre, unit normal, least cosine between the normal and the half vector.
+        eye: float64 [4], see ``patch_weights``.
+        slack_rad: how far the half vector may turn until the next call.
+        mark: uint8 [p], scratch.
+        index: int32 [p], out: their numbers, ascending.
+    """
+    ex, ey, ez, gz = np.float32(eye[0]), np.float32(eye[1]), np.float32(eye[2]), np.float32(eye[3])
+    turn_cosine, turn_sine = np.float32(math.cos(slack_rad)), np.float32(math.sin(slack_rad))
+    one = np.float32(1.0)
+    for p in range(len(facing)):
+        dx, dy = ex - facing[p, 0], ey - facing[p, 1]
+        za, zb = ez - facing[p, 2], gz - facing[p, 2]
+        flat = dx * dx + dy * dy
+        ra, rb = one / np.sqrt(flat + za * za), one / np.sqrt(flat + zb * zb)
+        side = facing[p, 3] * dx + facing[p, 4] * dy
+        ca, cb = (side + facing[p, 5] * za) * ra, (side + facing[p, 5] * zb) * rb
+        cosine = facing[p, 6]
+        least = max(cosine * turn_cosine - np.sqrt(max(one - cosine * cosine, np.float32(0.0))) * turn_sine, 0)
+        half2 = np.float32(2.0) * (one + (flat + za * zb) * ra * rb)
+        both = (ca + cb) * (ca + cb) >= least * least * half2
+        mark[p] = np.uint8((abs(ca) >= least) | (abs(cb) >= least) | both)
+    count = 0
+    for p in range(len(facing)):
+        index[count] = p
+        count += mark[p]
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def patch_weights(
+    candidate: Int32,
+    shape: Float32,
+    area: Float32,
+    spread: Float32,
+    reflection: Float32,
+    roughness: Float32,
+    seen: UInt8,
+    eye: Float64,
+    path: int,
+    wavelength: float,
+    limits: Float64,
+    keep: float,
+    index: Int32,
+    weight: Complex64,
+    level: Float32,
+) -> int:  # pragma: no cover - compiled
+    """Scattering amplitudes of the patches over one class of paths; returns how many entries were written.
+
+    sqrt(sigma) = sqrt(4 pi) / lambda |Gamma| c I(q), q = -2 pi / lambda (u_t + u_r) with u the unit vectors from the
+    patch to the ends of the two legs (phases grow with the path's length), c = |N . (u_t + u_r)| / 2.
+
+    Args:
+        candidate: int32 [c], numbers of the patches that may matter.
+        shape, area, spread, reflection, roughness: columns of the patches (``points.Patches``).
+        seen: uint8 [c], bits SEEN and SEEN_IN_GROUND of the candidates.
+        eye: float64 [4], the radar in the object's frame, x, y, z, and the z of its image below the ground.
+        path: DIRECT, MIXED or GROUND.
+        wavelength: metres.
+        limits: float64 [2], q_t^2 A beyond which a flat patch and sin^2 of the angle off its normal beyond which any
+            patch sends nothing; it fades from half of it on.
+        keep: share of the greatest |level|^2 so far below which an entry is not written.
+        index, weight, level: out: patch, sqrt(sigma) exp(j phase) in m, and |weight| / (R_t R_r).
+    """
+    k = 2.0 * math.pi / wavelength
+    front = math.sqrt(4.0 * math.pi) / wavelength
+    need = SEEN if path == DIRECT else SEEN_IN_GROUND if path == GROUND else SEEN | SEEN_IN_GROUND
+    z_tx, z_rx = eye[3] if path == GROUND else eye[2], eye[2] if path == DIRECT else eye[3]
+    count, strongest = 0, 0.0
+    for i in range(len(candidate)):
+        if seen[i] & need != need:
+            continue
+        p = candidate[i]
+        dx, dy = eye[0] - shape[p, 0, 0], eye[1] - shape[p, 0, 1]
+        za, zb = z_tx - shape[p, 0, 2], z_rx - shape[p, 0, 2]
+        flat = dx * dx + dy * dy
+        ra2, rb2 = flat + za * za, flat + zb * zb
+        ra, rb = 1.0 / math.sqrt(ra2), 1.0 / math.sqrt(rb2)
+        nx, ny, nz = np.float64(shape[p, 1, 0]), np.float64(shape[p, 1, 1]), np.float64(shape[p, 1, 2])
+        side = nx * dx + ny * dy
+        ca, cb = (side + nz * za) * ra, (side + nz * zb) * rb
+        if ca * cb <= 0.0:
+            continue
+        qx, qy, qz = -k * dx * (ra + rb), -k * dy * (ra + rb), -k * (za * ra + zb * rb)
+        normal = k * (ca + cb)
+        whole = qx * qx + qy * qy + qz * qz
+        plane = max(whole - normal * normal, 0.0)
+        away = plane / (whole * limits[1])
+        incidence = 0.5 * abs(ca + cb)
+        lobe = LOBE * wavelength * wavelength / area[p]
+        scale = front * incidence * reflection[p] * math.exp(-roughness[p] * incidence * incidence)
+        curved = spread[p] > CURVED_FROM * lobe
+        if not curved:
+            away = max(away, plane * area[p] / limits[0])
+        if away >= 1.0:
+            continue
+        if curved:
+            wide = lobe + spread[p]
+            exponent = plane / (normal * normal) / (4.0 * wide)
+            if exponent > MOST_EXPONENT:
+                continue
+            size = area[p] * math.sqrt(lobe / wide) * math.exp(-exponent)
+        else:
+            size = np.float64(area[p])
+        size *= _fade(away)
+        bound = scale * size * ra * rb
+        if bound * bound < keep * strongest:
+            continue
+        if curved:
+            value = complex(scale * size, 0.0)
+        else:
+            value = triangle_integral(qx, qy, qz, shape[p]) * (scale * size / area[p])
+        power = (value.real * value.real + value.imag * value.imag) / (ra2 * rb2)
+        if power < keep * strongest or power == 0.0:
+            continue
+        strongest = max(strongest, power)
+        index[count], weight[count], level[count] = p, value, math.sqrt(power)
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def point_weights(
+    position: Float32,
+    axis: Float32,
+    kind: Int8,
+    amplitude: Complex64,
+    length: Float32,
+    seen: UInt8,
+    eye: Float64,
+    path: int,
+    wavelength: float,
+    index: Int32,
+    weight: Complex64,
+    level: Float32,
+) -> int:  # pragma: no cover - compiled
+    """The same for points (``points.Points``): diffuse ones fall with cos, edges with the sinc of their length."""
+    k = 2.0 * math.pi / wavelength
+    need = SEEN if path == DIRECT else SEEN_IN_GROUND if path == GROUND else SEEN | SEEN_IN_GROUND
+    z_tx, z_rx = eye[3] if path == GROUND else eye[2], eye[2] if path == DIRECT else eye[3]
+    count = 0
+    for p in range(len(kind)):
+        if seen[p] & need != need:
+            continue
+        dx, dy = eye[0] - position[p, 0], eye[1] - position[p, 1]
+        za, zb = z_tx - position[p, 2], z_rx - position[p, 2]
+        flat = dx * dx + dy * dy
+        ra, rb = 1.0 / math.sqrt(flat + za * za), 1.0 / math.sqrt(flat + zb * zb)
+        factor = 1.0
+        if kind[p] != 0:
+            side = axis[p, 0] * dx + axis[p, 1] * dy
+            a, b = (side + axis[p, 2] * za) * ra, (side + axis[p, 2] * zb) * rb
+            if kind[p] == 1:
+                factor = math.sqrt(a * b) if a * b > 0.0 else 0.0
+            else:
+                factor = _sinc(0.5 * k * (a + b) * length[p])
+        if factor == 0.0:
+            continue
+        index[count], weight[count] = p, amplitude[p] * np.float32(factor)
+        level[count] = abs(weight[count]) * ra * rb
+        count += 1
+    return count

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of the z-buffer: triangles to inverse depth, points against it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from edge.frames import Float32, Float64
+from train.objects.sampling import Int32
+
+UInt8 = NDArray[np.uint8]
+
+NEAR_M = 0.05
+"""Triangles with a corner nearer to the camera's plane are left out."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def to_camera(
+    vertices: Float32, rotation: Float64, eye: Float64, out: Float32, window: Float64
+) -> None:  # pragma: no cover - compiled
+    """Vertices in a camera's frame, and the window of slopes that holds them.
+
+    Args:
+        vertices: float32 [n, 3], object frame.
+        rotation: float64 [3, 3], rows: the camera's right, down and forward axes in the object's frame.
+        eye: float64 [3], the camera in the object's frame.
+        out: float32 [n, 3], out: x / z, y / z, 1 / z; all zero for vertices that are not in front.
+        window: float64 [4], in and out: lowest x / z and y / z, highest; widened to hold the vertices in front.
+    """
+    r = rotation
+    for i in range(len(vertices)):
+        x, y, z = vertices[i, 0] - eye[0], vertices[i, 1] - eye[1], vertices[i, 2] - eye[2]
+        ahead = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+        if ahead < NEAR_M:
+            out[i, 0], out[i, 1], out[i, 2] = 0.0, 0.0, 0.0
+            continue
+        inverse = 1.0 / ahead
+        u = (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z) * inverse
+        v = (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z) * inverse
+        out[i, 0], out[i, 1], out[i, 2] = u, v, inverse
+        window[0], window[1] = min(window[0], u), min(window[1], v)
+        window[2], window[3] = max(window[2], u), max(window[3], v)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+def rasterize(
+    camera: Float32, faces: Int32, focal: float, column: float, row: float, inverse_depth: Float32
+) -> None:  # pragma: no cover - compiled
+    """Greatest inverse depth at every pixel centre; 1 / z is linear in the picture.
+
+    Args:
+        camera: float32 [n, 3], from ``to_camera``.
+        faces: int32 [m, 3].
+        focal, column, row: pixels = focal slope + column (row).
+        inverse_depth: float32 [rows, columns], in and out; 0 where nothing is.
+    """
+    rows, columns = inverse_depth.shape
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ia, ib, ic = camera[a, 2], camera[b, 2], camera[c, 2]
+        if ia == 0.0 or ib == 0.0 or ic == 0.0:
+            continue
+        au, av = focal * camera[a, 0] + column, focal * camera[a, 1] + row
+        bu, bv = focal * camera[b, 0] + column, focal * camera[b, 1] + row
+        cu, cv = focal * camera[c, 0] + column, focal * camera[c, 1] + row
+        low_v, high_v = max(0.0, math.ceil(min(av, bv, cv))), min(rows - 1.0, math.floor(max(av, bv, cv)))
+        low_u, high_u = max(0.0, math.ceil(min(au, bu, cu))), min(columns - 1.0, math.floor(max(au, bu, cu)))
+        if low_v > high_v or low_u > high_u:
+            continue
+        area = (bu - au) * (cv - av) - (bv - av) * (cu - au)
+        if area == 0.0:
+            continue
+        scale = 1.0 / area
+        # Barycentric coordinates are linear: value at the first pixel, steps along columns and rows.
+        wa_u, wa_v = (bv - cv) * scale, (cu - bu) * scale
+        wb_u, wb_v = (cv - av) * scale, (au - cu) * scale
+        wa_row = ((bu - low_u) * (cv - low_v) - (bv - low_v) * (cu - low_u)) * scale
+        wb_row = ((cu - low_u) * (av - low_v) - (cv - low_v) * (au - low_u)) * scale
+        d_u = wa_u * (ia - ic) + wb_u * (ib - ic)
+        first_u, width = int(low_u), int(high_u - low_u) + 1
+        for v in range(int(low_v), int(high_v) + 1):
+            wa, wb = wa_row, wb_row
+            depth = ic + wa * (ia - ic) + wb * (ib - ic)
+            for u in range(width):
+                if wa >= 0.0 and wb >= 0.0 and wa + wb <= 1.0 and depth > inverse_depth[v, first_u + u]:
+                    inverse_depth[v, first_u + u] = depth
+                wa += wa_u
+                wb += wb_u
+                depth += d_u
+            wa_row += wa_v
+            wb_row += wb_v
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def farthest(inverse_depth: Float32, out: Float32) -> None:  # pragma: no cover - compiled
+    """Smallest inverse depth of every pixel's 3 x 3 neighbourhood (fewer at the rim); 0 where one of them is empty."""
+    rows, columns = inverse_depth.shape
+    for v in range(rows):
+        for u in range(columns):
+            least = inverse_depth[v, u]
+            for y in range(max(v - 1, 0), min(v + 2, rows)):
+                for x in range(max(u - 1, 0), min(u + 2, columns)):
+                    least = min(least, inverse_depth[y, x])
+            out[v, u] = least
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def test_points(
+    points: Float32,
+    index: Int32,
+    rotation: Float64,
+    eye: Float64,
+    focal: float,
+    column: float,
+    row: float,
+    farthest_inverse: Float32,
+    bias: float,
+    bit: int,
+    seen: UInt8,
+) -> None:  # pragma: no cover - compiled
+    """Clear ``bit`` of the points that something in the picture hides; points beside the picture keep it.
+
+    Args:
+        points: float32 [m, 3], object frame.
+        index: int32 [n], which of them.
+        rotation, eye: the camera in the object's frame.
+        focal, column, row: of the picture.
+        farthest_inverse: float32 [rows, columns], from ``farthest``.
+        bias: metres that a point may lie deeper than what the picture shows.
+        bit: which.
+        seen: uint8 [n], in and out.
+    """
+    r = rotation
+    rows, columns = farthest_inverse.shape
+    for i in range(len(index)):
+        p = index[i]
+        x, y, z = points[p, 0] - eye[0], points[p, 1] - eye[1], points[p, 2] - eye[2]
+        ahead = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+        if ahead < NEAR_M:
+            continue
+        scale = focal / ahead
+        u = math.floor((r[0, 0] * x + r[0, 1] * y + r[0, 2] * z) * scale + column + 0.5)
+        v = math.floor((r[1, 0] * x + r[1, 1] * y + r[1, 2] * z) * scale + row + 0.5)
+        if u >= 0 and v >= 0 and u < columns and v < rows and (ahead - bias) * farthest_inverse[v, u] > 1.0:
+            seen[i] &= np.uint8(255 - bit)
