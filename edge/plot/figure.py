@@ -88,13 +88,17 @@ def dress(axes: Any, title: str, x_label: str, y_label: str) -> None:
         axes.spines[side].set_color(GRID)
 
 
-def write(figure: Any, path: Path) -> Path:
+def write(figure: Any, path: Path, dpi: int = DPI) -> Path:
     """Write a PNG; a letter that the font lacks is an empty box.
 
+    Args:
+        figure: of ``new_figure``.
+        path: of the PNG.
+        dpi: pixels per inch.
     Returns:
         ``path``.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(path, dpi=DPI)
+        figure.savefig(path, dpi=dpi)
     return path
