@@ -133,9 +133,11 @@ class Synthesizer:
         chips = len(self._receivers_m)
         self._grid = np.zeros((chips, layout.slots, self._cells + self._margin, LANES), dtype=np.float32)
         self._lines = np.zeros((chips, layout.slots, self._cells, RX), dtype=np.complex64)
-        self.correction = self._correction()
-        """float32 [samples]: takes the weights' own spectrum out of the inverse FFT."""
-        self._no_filter = np.ones(self._cells + 1, dtype=np.complex64)
+        self._signal = np.zeros((chips, layout.slots, layout.samples * RX), dtype=np.complex64)
+        self._correction = _correction(SHAPES[width], layout.samples, self._cells)
+        self._no_filter = self._response = np.ones(self._cells + 1, dtype=np.complex64)
+        self._filtered_by: FrontEnd | None = None
+        self._moving = False
         self._path = np.zeros((2, RX, BLOCK))
         self._scratch = np.zeros((6, RX, BLOCK), dtype=np.float32)
         self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
@@ -155,22 +157,18 @@ class Synthesizer:
             ConfigError: ground paths without a ground.
         """
         layout = self._layout
-        loops = self._loops(scatterers)
+        loops = layout.loops if scatterers.velocity_m_s.any() else 1
         shape = (loops, layout.slots, layout.devices * RX, layout.samples)
         if self._beat is None or len(self._beat) != loops:
             self._beat = np.empty(shape, dtype=np.complex64)
         self._place(scatterers, ground, self._no_filter)
         for loop in range(loops):
-            lines = self._synthesize(len(scatterers), loop, bool(scatterers.velocity_m_s.any()), None)
+            lines = self._synthesize(len(scatterers), loop)
             half = layout.samples // 2
             samples = np.concatenate((lines[:, :, -half:], lines[:, :, : layout.samples - half]), axis=2)
-            samples *= self.correction[:, None]
+            samples *= self._correction.reshape(-1, RX)
             self._beat[loop] = samples.transpose(1, 0, 3, 2).reshape(shape[1:])
         return self._beat if loops > 1 else np.broadcast_to(self._beat, (layout.loops, *shape[1:]))
-
-    def _loops(self, scatterers: Scatterers) -> int:
-        """Loops that differ: all when anything moves."""
-        return self._layout.loops if bool(scatterers.velocity_m_s.any()) else 1
 
     def _place(self, scatterers: Scatterers, ground: GroundPlane | None, response: Complex64) -> None:
         """Take over the scatterers: mirrored legs, curvature of moving paths, receiver's response."""
@@ -193,25 +191,27 @@ class Synthesizer:
             *(k, work.points, scatterers.amplitude, self._centre_m, scale_m, self._offset_m, response, work.amplitude)
         )
         work.bend[:k] = 0.0
-        if scatterers.velocity_m_s.any():
+        self._moving = bool(scatterers.velocity_m_s.any())
+        if self._moving:
             away_m = work.points[1, :, :k] - self._centre_m[:, None]
             range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
             velocity = work.velocity[1, :, :k]
             radial = (velocity * away_m).sum(axis=0) / range_m
             work.bend[:k] = 0.5 * (np.square(velocity).sum(axis=0) - np.square(radial)) / range_m
 
-    def _synthesize(self, k: int, loop: int, moving: bool, jitter_s: Float64 | None) -> Complex64:
+    def _synthesize(self, k: int, loop: int, front_end: FrontEnd | None = None, number: int = 0) -> Complex64:
         """Inverse FFT of one loop [chips, slots, cells, RX], sample i of the window at cell i - samples / 2."""
         work, slots = self._work, self._layout.slots
         time_s = (loop * slots + np.arange(slots)) * self._slot_s
         middle_s = float(time_s.mean())
+        jitter_s = None if front_end is None else front_end.jitter_s(number, loop)
         self._scale[2:] = 0.0 if jitter_s is None else jitter_s * self._jitter_turns_per_m_s
         transmit_legs(
             *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
             *(self._scale, work.phasor, work.cell_out, work.base_out, work.reach_out),
         )
         first_s = float(time_s[0])
-        timing = np.array([middle_s, first_s, self._slot_s if moving else 0.0])
+        timing = np.array([middle_s, first_s, self._slot_s if self._moving else 0.0])
         scale = np.array([self._scale[0], self._scale[1], self._offset_m])
         receive_legs(
             *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing, SHAPES[self.width], self.width),
@@ -226,12 +226,29 @@ class Synthesizer:
                     *(float(time_s[slot]) - middle_s, work.base_out, work.base_back, work.legs[chip], self._margin),
                     *(work.plan, work.start, self._grid[chip, slot].reshape(-1)),
                 )
-                if moving and slot + 1 < slots:
+                if self._moving and slot + 1 < slots:
                     turn_legs(k, work.legs[chip], work.turn[chip])
         fold(self._grid.reshape(-1, *self._grid.shape[2:]), self._margin, self._cells)
         spectrum = self._grid[:, :, self._margin :].view(np.complex64)
-        np.fft.ifft(spectrum, axis=2, norm="forward", out=self._lines)
+        np.fft.ifft(spectrum, axis=2, norm="forward", out=self._lines)  # type: ignore[arg-type]
+        frequency_hz = None if front_end is None else front_end.frequency_noise_hz(number, loop)
+        if frequency_hz is not None:
+            self._add_phase_noise(spectrum, frequency_hz)
         return self._lines
+
+    def _add_phase_noise(self, spectrum: Complex64, frequency_hz: Float64) -> None:
+        """Lines times 1 + j 2 pi tau nu: the delay tau of an echo is its cell on the grid.
+
+        Args:
+            spectrum: complex64 [chips, slots, cells, RX].
+            frequency_hz: nu, float64 [slots, samples].
+        """
+        profile = self.radar.schedule.profile
+        delay_s = np.arange(self._cells) * profile.sample_rate_hz / (profile.slope_hz_per_s_actual * self._cells)
+        delayed = np.fft.ifft(spectrum * delay_s[:, None].astype(np.float32), axis=2, norm="forward")
+        place = (np.arange(self._layout.samples) - self._layout.samples // 2) % self._cells
+        turn = (2j * np.pi * frequency_hz).astype(np.complex64)
+        self._lines[:, :, place] += turn[:, :, None] * delayed[:, :, place]
 
     def _require_reach(self, k: int) -> None:
         """Refuse scatterers whose beat lies outside of what the receiver passes."""
@@ -249,12 +266,6 @@ class Synthesizer:
                 action="leave scatterers beyond Synthesizer.reach_m out",
             )
 
-    def _correction(self) -> Float32:
-        """Inverse of the weights' Fourier transform at every sample."""
-        b = SHAPES[self.width]
-        index = np.arange(self._layout.samples) - self._layout.samples // 2
-        return np.asarray(np.sqrt(b / np.pi) * np.exp(np.square(np.pi * index / self._cells) / b), dtype=np.float32)
-
     def frame(
         self,
         scatterers: Scatterers,
@@ -264,5 +275,53 @@ class Synthesizer:
         ground: GroundPlane | None = None,
         out: Int16 | None = None,
     ) -> RadarFrame:
-        """Burst as the board would send it."""
-        raise NotImplementedError
+        """One burst as the board sends it.
+
+        Args:
+            scatterers: as this radar sees them in this burst.
+            front_end: of the same radar; adds its faults and the noise of this frame.
+            number, t_first_chirp_ns: of the frame.
+            ground: as in ``beat``.
+            out: int16 array of the capture's shape to write into; None: a new one.
+        Raises:
+            RangeError, ConfigError: as ``beat``.
+        """
+        layout, chips = self._layout, len(self._receivers_m)
+        adc = np.empty(layout.shape, dtype=np.int16) if out is None else out
+        direct = layout.kind == "cascade" and layout.iq_order == "IQ"
+        shape = (chips, layout.loops, layout.slots, layout.samples * LANES)
+        codes = adc.reshape(shape) if direct else np.empty(shape, dtype=np.int16)
+        self._place(scatterers, ground, self._filter(front_end))
+        changing = self._moving or front_end.per_chirp
+        for loop in range(layout.loops):
+            if loop == 0 or changing:
+                lines = self._synthesize(len(scatterers), loop, front_end, number)
+                front_end.compose(lines.reshape(chips, layout.slots, -1), self._correction, self._signal)
+            front_end.digitise(self._signal, number, loop, codes)
+        if not direct:
+            _reorder(codes, layout, adc)
+        return RadarFrame(self.radar.radar, number, t_first_chirp_ns, adc, layout)
+
+    def _filter(self, front_end: FrontEnd) -> Complex64:
+        """The IF's response, kept while the front end is the same."""
+        if self._filtered_by is not front_end:
+            self._filtered_by, self._response = front_end, front_end.if_response(self._cells)
+        return self._response
+
+
+def _correction(b: float, samples: int, cells: int) -> Float32:
+    """Inverse of the weights' Fourier transform at every sample, for all receivers of a group [samples * RX]."""
+    index = np.arange(samples) - samples // 2
+    inverse = np.sqrt(b / np.pi) * np.exp(np.square(np.pi * index / cells) / b)
+    return np.repeat(inverse, RX).astype(np.float32)
+
+
+def _reorder(codes: Int16, layout: Layout, adc: Int16) -> None:
+    """Codes [chips, loops, slots, samples * rx * 2], I first, into the capture's own order."""
+    parts = codes.reshape(*codes.shape[:3], layout.samples, RX, 2)
+    parts = parts[..., ::-1] if layout.iq_order == "QI" else parts
+    if layout.kind == "cascade":
+        adc[:] = parts
+        return
+    halves = parts[0].reshape(layout.loops, layout.slots, layout.samples // 2, 2, RX, 2)
+    adc.reshape(layout.loops, layout.slots, RX, layout.samples // 2, 2, 2)[:] = halves.transpose(0, 1, 4, 2, 5, 3)
