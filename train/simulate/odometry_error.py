@@ -99,7 +99,7 @@ def _correlated(stamps_ns: NDArray[np.int64], settings: OdometrySettings, rng: n
     keep = np.exp(-np.diff(stamps_ns) / (NS_PER_S * settings.tilt_s))
     for k, share in enumerate(keep, 1):
         values[k] = share * values[k - 1] + math.sqrt(1.0 - share * share) * values[k]
-    return np.radians(settings.tilt_deg) * values
+    return np.asarray(math.radians(settings.tilt_deg) * values)
 
 
 def _from_angles(roll_rad: Float64, pitch_rad: Float64, yaw_rad: Float64) -> Float64:
