@@ -14,6 +14,7 @@ from edge.config import AntennaSettings, HeatmapSettings, require
 from edge.dsp import tables, tdm
 from edge.dsp.across import AcrossMotion
 from edge.dsp.antenna import along_loss_db
+from edge.dsp.buffers import aligned, zeros
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
 from edge.dsp.doppler import DopplerFft
 from edge.dsp.effective_cells import noise_correlation
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from edge.rig import Radar
 
 SHORTEST_RANGE_M = 0.05
-ANGLE_LANES = 32
+ANGLE_LANES = 64
 LARGEST_MOTION_ERROR_RAD = 0.01
 """Motion's phase error over the row, rms at the edge of the field of view, that is left alone."""
 
@@ -130,17 +131,15 @@ class Imager:
         channel = np.asarray(calibration.gain)[..., None] * ramp * (taper / taper.sum())
         angle_taper = tables.taper(self.settings, "angle", geometry.count, (geometry.count - 1) / 2)
         weight = geometry.channel_weight(angle_taper / angle_taper.sum())
-        frequency = tables.frequency_of_row(self.points)
-        self._rows = np.argsort(frequency).astype(np.int64) * rx
+        self._rows = np.arange(self.points, dtype=np.int64) * rx
         phase = np.zeros((*weight.shape, self.points))
         if self.settings.focus:
             a, b = geometry.transmit_m[:, None, None], geometry.receive_m[None, :, None]
             baked = tables.curvature_m(calibration.reference_range_m, a, b)
             phase = -2.0 * np.pi / self._wavelength_m * (tables.curvature_m(self._focus_range_m, a, b) - baked)
-        phasor = np.exp(1j * phase[..., frequency])
-        self._window = np.zeros((len(self._pairs), 2, self.points * rx), dtype=np.float32)
-        self._focus = np.zeros((self._row_blocks, 2, self.points * rx), dtype=np.float32)
-        self._phasors = np.zeros_like(self._focus)
+        phasor = np.exp(1j * phase)
+        self._window = zeros((len(self._pairs), 2, self.points * rx))
+        self._focus, self._phasors = (zeros((self._row_blocks, 2, self.points * rx)) for _ in range(2))
         self._elevation = ElevationRows(
             *(self.radar, self._pairs, phasor, self._rows, geometry.transmit_m[:, None] + geometry.receive_m),
             *(self._transmit_time_s, self._wavelength_m),
@@ -196,24 +195,25 @@ class Imager:
 
     def _make_buffers(self) -> None:
         layout, bins, plane = self.layout, self.settings.angle_bins, self.points * self.layout.rx
-        self._range_kernel = range_kernel(layout.kind == "cascade", layout.iq_order == "QI", self.points, layout.rx)
+        self._range_kernel = range_kernel(layout.kind == "cascade", layout.iq_order == "QI", self.points)
         self._channel_kernel = channel_kernel(self.points, layout.rx)
-        self._row_kernel = row_kernel(self.points, layout.rx)
+        self._row_kernel = row_kernel(self.points)
         self._angle_kernel = angle_kernel(bins, self.points, ANGLE_LANES)
-        self._range_twiddle = tables.twiddles(self.points, -1, layout.rx)
+        self._range_twiddle = aligned(tables.twiddles(self.points, -1, layout.rx))
+        self._range_order = tables.last_stage_order(self.points)
         self._angle_twiddle = tables.twiddles(bins, +1, 0)
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
         self._phasor = np.ones(layout.slots, dtype=np.complex64)
-        self._spectra = np.zeros((len(self._pairs), 2 * plane), dtype=np.float32)
-        self._sums = np.zeros(2 * plane, dtype=np.float32)
-        self._row_work = np.zeros(2 * plane, dtype=np.float32)
-        self._angle_work = np.zeros(2 * bins * ANGLE_LANES, dtype=np.float32)
-        self._row = np.zeros((2, self.geometry.count, self.points), dtype=np.float32)
-        self._power = np.zeros((bins, self.points), dtype=np.float32)
+        self._spectra, self._sums = zeros((len(self._pairs), 2 * plane)), zeros(2 * plane)
+        self._spectra_rows = self._spectra.view(np.complex128)
+        self._range_work, self._row_work = zeros(2 * plane), zeros(2 * plane)
+        self._range_rows = self._range_work.view(np.complex128)
+        self._row, self._angle_work = zeros((2, self.geometry.count, self.points)), zeros(2 * bins * ANGLE_LANES)
+        self._power = zeros((bins, self.points))
         self._aligned = np.zeros(layout.int16_count // 2, dtype=np.int32)
         self._dead = np.zeros((layout.slots, layout.devices * layout.rx), dtype=np.uint8)
         loops = tables.next_power_of_two(self._most_loops)
-        self._cube = np.zeros((len(self._channels.slot), loops, 2, self.points + PADDING), dtype=np.float32)
+        self._cube = zeros((len(self._channels.slot), loops, 2, self.points + PADDING))
         time_s = self._transmit_time_s + self._loop_time_s * np.arange(self._most_loops)[:, None]
         self._steering = Steering(
             *(self.geometry, self._channels, self.settings, time_s, self._wavelength_m, self.points, self._gain),
@@ -305,7 +305,8 @@ class Imager:
         """Fill ``_spectra`` from the raw words, summed over loops; returns the codes at the rails."""
         rails = self._range_kernel(
             *(adc, loops, self._loop_stride, self._block_start[:blocks], self.layout.samples, self._window),
-            *(self._range_twiddle, self._sums, self._spectra),
+            *(self._range_twiddle, self._range_order, self._sums, self._range_work, self._range_rows),
+            *(self._spectra, self._spectra_rows),
         )
         return int(rails)
 
@@ -348,10 +349,8 @@ class Imager:
 
     def _run_angle(self, sector: tdm.Sector) -> None:
         """Fill the sector's rows of ``_power`` from ``_spectra`` and ``_phasor``."""
-        self._row_kernel(
-            *(self._spectra, self._block_slot, self._block_element, self._focus, self._rows, self._phasor),
-            *(self._row_work, self._row),
-        )
+        blocks = (self._spectra, self._block_slot, self._block_element, self._focus)
+        self._row_kernel(*blocks, self._phasor, self._row_work, self._row)
         self._angle_kernel(
             *(self._row, self._angle_twiddle, self._target, self._gain, sector.first, sector.last),
             *(self._angle_work, self._power),

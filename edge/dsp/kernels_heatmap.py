@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels from raw int16 samples to range-angle power: loop sum, range FFT, channel gather, angle FFT, power.
 
-Both FFTs are radix-4 decimation in frequency, in place, vectorised across transforms: real and imaginary planes of one
-flat float32 buffer, lanes innermost, literal strides (closure constants), digit-reversed rows undone by the store.
-Unsigned indices spare the inner loops Numba's wrap-around of negative ones, which would keep them from vectorising.
+Both FFTs are radix-4 decimation in frequency, vectorised across transforms: real and imaginary planes of one flat
+float32 buffer, lanes innermost, literal strides (closure constants). The angle FFT's lanes are range bins. The range
+FFT's are a device's four receivers, too few for the last stage, before which its rows change places: the last digit
+comes first, with all other rows as lanes, and the digit reversal is undone on the way. Unsigned indices spare the inner
+loops Numba's wrap-around of negative ones, which would keep them from vectorising; so would a slice of an array, which
+counts references. Buffers begin on cache lines (edge/dsp/buffers.py).
 """
 
 from __future__ import annotations
@@ -13,9 +16,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import complex64, float32, float64, int32, int64, njit, types, uint64
+from numba import complex64, complex128, float32, float64, int32, int64, njit, types, uint64
 
 RAIL = 32767
+RECEIVERS = 4
+"""Of one device, all there are: their float32 values are moved as one complex128."""
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 RAW = types.Array(int32, 1, "C", readonly=True)
@@ -144,51 +149,54 @@ def _window(acc, window, b, work, im):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _focus(spectrum, focus, b, pr, pi, work, im):  # type: ignore[no-untyped-def]
-    """The spectrum, in memory order, times the focusing phasor, the taper and the slot's Doppler phasor."""
-    for x in range(im):
-        fr, fi = focus[b, 0, x], focus[b, 1, x]
-        cr, ci = fr * pr - fi * pi, fr * pi + fi * pr
-        re, i = spectrum[x], spectrum[x + im]
-        work[x] = re * cr - i * ci
-        work[x + im] = re * ci + i * cr
+def _turn(work, out, order, groups, last, half):  # type: ignore[no-untyped-def]
+    """Rows of all receivers: ``out[p, k] = work[order[k] + p]``, p the last digit; two planes of ``half`` rows."""
+    for p in range(last):
+        for k in range(groups):
+            x, y = uint64(order[k] + p), uint64(p * groups + k)
+            out[y] = work[x]
+            out[y + uint64(half)] = work[x + uint64(half)]
 
 
 @njit(inline="always")
-def _gather(work, rows, element, points, rx, im, row):  # type: ignore[no-untyped-def]
-    """Add the block's channels to their elements of the virtual row, undoing the digit reversal."""
-    for r in range(rx):
-        e = element[r]
-        if e >= 0:
-            for k in range(points):
-                x = uint64(rows[k] + r)
-                row[0, e, k] += work[x]
-                row[1, e, k] += work[x + uint64(im)]
+def _focus(spectra, focus, b, pr, pi, points, rx, im, work):  # type: ignore[no-untyped-def]
+    """A block's spectra times focusing phasor, taper and the slot's Doppler phasor into work [(re, im), rx, point]."""
+    for k in range(points):
+        for r in range(rx):
+            x, y = uint64(k * rx + r), uint64(r * points + k)
+            fr, fi = focus[b, 0, x], focus[b, 1, x]
+            cr, ci = fr * pr - fi * pi, fr * pi + fi * pr
+            re, i = spectra[b, x], spectra[b, x + uint64(im)]
+            work[y] = re * cr - i * ci
+            work[y + uint64(im)] = re * ci + i * cr
 
 
 @cache
-def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Callable[..., Any]:
+def range_kernel(interleaved: bool, swapped: bool, points: int) -> Callable[..., Any]:
     """Compile the kernel from raw samples to the virtual row's range spectra.
 
     Args:
         interleaved: raw chirps are [sample, rx, 2] (cascade); else [rx, sample / 2, 4] (DCA1000).
         swapped: Q comes before I.
         points: length of the FFT, a power of two, 64..1024; shorter chirps are zero-padded.
-        rx: receivers of one device.
     Returns:
         kernel(adc [values / 2], loops, loop_stride, start int64 [block], samples, window [block, 2, points * rx],
-        twiddle, acc [2 * points * rx], spectra [block, 2 * points * rx]) -> components at the rails.
-        ``spectra`` receives each block's [(re, im), row, rx] with digit-reversed rows; ``acc`` must hold zeros beyond
-        ``samples * rx`` of each plane.
+        twiddle, order int64 (``tables.last_stage_order``), acc [2 * points * rx], work as acc, work_rows (the same as
+        complex128), spectra [block, 2 * points * rx], spectra_rows (the same as complex128)) -> components at the
+        rails. ``spectra`` receives each block's [(re, im), range, rx]; ``acc`` must hold zeros beyond ``samples * rx``
+        of each plane.
     """
-    im = points * rx
-    radix2 = points in (128, 512)
+    rx = RECEIVERS
+    im, last = points * rx, 2 if points in (128, 512) else 4
     signature = int64(
-        *(RAW, int64, int64, int64[::1], int64, float32[:, :, ::1], float32[::1], float32[::1], float32[:, ::1])
+        *(RAW, int64, int64, int64[::1], int64, float32[:, :, ::1], float32[::1], int64[::1], float32[::1]),
+        *(float32[::1], complex128[::1], float32[:, ::1], complex128[:, ::1]),
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(adc, loops, loop_stride, start, samples, window, twiddle, acc, spectra):  # type: ignore[no-untyped-def]
+    def kernel(  # type: ignore[no-untyped-def]
+        adc, loops, loop_stride, start, samples, window, twiddle, order, acc, work, work_rows, spectra, spectra_rows
+    ):
         rails = 0
         to_i = im if swapped else 0
         for b in range(len(start)):
@@ -199,7 +207,6 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
                     rails += int64(_add_interleaved(adc, first, samples * rx, keep, acc, to_i, im - to_i))
                 else:
                     rails += int64(_add_pairwise(adc, first, samples, rx, keep, acc, to_i, im - to_i))
-            work = spectra[b]
             _window(acc, window, b, work, im)
             _wide_stage(work, twiddle, 0, 1, im // 4, im)
             _wide_stage(work, twiddle, 2 * (im - im // 4), 4, im // 16, im)
@@ -207,40 +214,46 @@ def range_kernel(interleaved: bool, swapped: bool, points: int, rx: int) -> Call
                 _wide_stage(work, twiddle, 2 * (im - im // 16), 16, im // 64, im)
             if points >= 512:
                 _wide_stage(work, twiddle, 2 * (im - im // 64), 64, im // 256, im)
-            if radix2:
-                _pair_stage(work, points // 2, rx, im)
+            _turn(work_rows, spectra_rows[b], order, points // last, last, points)
+            if last == 2:
+                _pair_stage(spectra[b], 1, im // 2, im)
             else:
-                _last_stage(work, points // 4, rx, im, float32(-1))
+                _last_stage(spectra[b], 1, im // 4, im, float32(-1))
         return rails
 
     return kernel
 
 
 @cache
-def row_kernel(points: int, rx: int) -> Callable[..., Any]:
+def row_kernel(points: int) -> Callable[..., Any]:
     """Compile the kernel that focuses the blocks' spectra, undoes motion for one direction and fills the virtual row.
 
     Args:
         points: range bins.
-        rx: receivers of one device.
     Returns:
         kernel(spectra [block, 2 * points * rx], slot int64 [block], element int64 [block, rx], focus [block, 2,
-        points * rx] in memory order, rows int64 [points], phasor complex64 [slot], work [2 * points * rx],
-        row [2, element, points]); ``row`` is overwritten.
+        points * rx], phasor complex64 [slot], work [2 * points * rx], row [2, element, points]); ``row`` is
+        overwritten.
     """
+    rx = RECEIVERS
     im = points * rx
     signature = types.void(
-        *(float32[:, ::1], int64[::1], int64[:, ::1], float32[:, :, ::1], int64[::1], complex64[::1]),
+        *(float32[:, ::1], int64[::1], int64[:, ::1], float32[:, :, ::1], complex64[::1]),
         *(float32[::1], float32[:, :, ::1]),
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(spectra, slot, element, focus, rows, phasor, work, row):  # type: ignore[no-untyped-def]
+    def kernel(spectra, slot, element, focus, phasor, work, row):  # type: ignore[no-untyped-def]
         row[:] = float32(0)
         for b in range(len(slot)):
             turn = phasor[slot[b]]
-            _focus(spectra[b], focus, b, turn.real, turn.imag, work, im)
-            _gather(work, rows, element[b], points, rx, im, row)
+            _focus(spectra, focus, b, turn.real, turn.imag, points, rx, im, work)
+            for r in range(rx):
+                e = element[b, r]
+                if e >= 0:
+                    for k in range(points):
+                        row[0, e, k] += work[uint64(r * points + k)]
+                        row[1, e, k] += work[uint64(r * points + k + im)]
 
     return kernel
 
@@ -305,7 +318,7 @@ def _whole_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # t
 
 
 @cache
-def angle_kernel(bins: int, points: int, lanes: int = 16, whole: bool = False) -> Callable[..., Any]:
+def angle_kernel(bins: int, points: int, lanes: int, whole: bool = False) -> Callable[..., Any]:
     """Compile the kernel from the virtual row's range spectra to power over direction cosine and range.
 
     Args:

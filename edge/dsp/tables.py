@@ -170,6 +170,15 @@ def frequency_of_row(points: int) -> Int64:
     return frequency
 
 
+def last_stage_order(points: int) -> Int64:
+    """Groups of rows before the last stage, in the order of their frequency: the first row of each.
+
+    The last stage (radix 4, or 2 for lengths 2 * 4^k) makes one group's rows p the frequencies k + p' * groups.
+    """
+    last = 4 if points.bit_length() % 2 else 2
+    return np.argsort(frequency_of_row(points)[::last]).astype(np.int64) * last
+
+
 def curvature_m(range_m: Float64 | float, transmit_m: Float64, receive_m: Float64) -> Float64:
     """Two-way path beyond 2 r of a boresight point at range r, exact: sqrt(r^2 + a^2) + sqrt(r^2 + b^2) - 2 r.
 

@@ -126,3 +126,12 @@ def test_no_bin_of_a_point_exceeds_its_envelope(name, count, bins):
     for offset in np.linspace(-0.5, 0.5, 21):
         line = np.abs(np.fft.fft(taper * np.exp(2j * np.pi * n * offset / bins), bins))
         assert np.all((line <= line[0] * envelope * (1 + 1e-9))[beyond])
+
+
+@pytest.mark.parametrize("points", [64, 128, 256, 512, 1024])
+def test_last_stage_ends_in_natural_order(points):
+    order, last = tables.last_stage_order(points), points // len(tables.last_stage_order(points))
+    frequency = tables.frequency_of_row(points)
+    groups = points // last
+    for p in range(last):
+        np.testing.assert_array_equal(frequency[order + p], np.arange(groups) + p * groups)
