@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rfconstruct-train``: fit a network, evaluate a model, export a checkpoint to a model folder."""
+"""``rfconstruct-train``: simulate data, fit a network, evaluate a model, export a checkpoint to a model folder."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edge.errors import ExitCode, ModelError, RfconstructError
+from train.objects.commands import add_verbs as object_verbs
+from train.simulate.command import add_verb
 
 if TYPE_CHECKING:
     from train.checkpoint import Checkpoint
@@ -58,7 +60,10 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--workers", type=int, default=1, help="processes that prepare samples")
     fit.add_argument("--squared", action="store_true", help="the squared distances of the paper's equations")
     fit.add_argument("--tensorboard", action="store_true", help="also write event files for TensorBoard")
+    fit.add_argument("--simulated", type=Path, help="folder or file of simulated clouds to mix in")
+    fit.add_argument("--simulated-share", type=float, default=0.5, help="of the training samples")
     fit.set_defaults(run=_fit)
+    add_verb(verbs)
     for name, run, text in (
         ("evaluate", _evaluate, "measure a model folder on held-out objects"),
         ("export", _export, "write a model folder from a checkpoint, measured, with card and manifest"),
@@ -77,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
             verb.add_argument("target", type=Path, help="model folder, for example models/default")
             verb.add_argument("--name", default="", help="of the model; the folder's name by default")
             verb.add_argument("--rig", action="append", help="rig the model fits; may be repeated (cascade_pair)")
+    object_verbs(verbs)
     return parser
 
 
@@ -93,6 +99,11 @@ def _fit(options: argparse.Namespace) -> int:
     settings = FitSettings(budget_s=60 * options.minutes, loss=LossSettings(squared=options.squared), **values)
     data = DatasetSettings.default(truth_points=_TRAIN_TRUTH, max_points=_TRAIN_POINTS)
     train = CompletionDataset("train", data, options.seed)
+    if options.simulated:
+        from train.simulated import SimulatedDataset
+
+        train = SimulatedDataset(options.simulated, "train", data, options.seed, options.simulated_share)
+        print(train.summary, flush=True)
     validation = CompletionDataset("val", DatasetSettings.default(), 0)
     Trainer(settings, train, validation, options.run_folder, options.resume).run()
     return int(ExitCode.OK)

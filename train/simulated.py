@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated radar clouds as training data: truth sampled from the object at load, mixed with perturbed geometry."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from edge.completion.sight import bearing_rad
+from edge.config import require
+from edge.errors import RecordingError
+from train.dataset import CompletionDataset, DatasetSettings, Sample
+from train.objects.library import SPLITS, Split
+from train.objects.mesh import CLASSES, Mesh, MeshError
+from train.objects.reference import HUMAN_FILE, ObjectRef
+from train.objects.sampling import sample_surface
+from train.simulate.shards import Cloud, read_clouds
+
+USABLE = ("whole", "split")
+"""Clouds that are the object's: not merged with something else, not missing."""
+THIN_SHARE, MIRROR_SHARE = 0.5, 0.5
+_SIZE_TOLERANCE_M = 2e-3
+_OWN = 1
+"""Sets the generator of a simulated sample apart from that of the perturbed one with the same index."""
+
+
+class SimulatedDataset(CompletionDataset):
+    """In train, ``CompletionDataset`` with a share of simulated clouds; in val and test, simulated clouds only.
+
+    Item ``index`` is a pure function of (split, seed, epoch, index, settings, share, set of clouds). The frame and its
+    errors are those of ``CompletionDataset``. In train a cloud is thinned half of the time (log-uniform, down to
+    ``min_points``) and mirrored half of the time; val and test take every cloud once, as it is. Samples that are not
+    simulated are the very ones that ``CompletionDataset`` gives for this index.
+
+    Args:
+        source: folder of a data set, or file of clouds.
+        split, settings, seed: as in ``CompletionDataset``.
+        share: chance of a simulated cloud in train, where its class has any.
+    Raises:
+        ConfigError: a share outside 0..1.
+        RecordingError: no readable set, or none of its clouds can be used here.
+    """
+
+    def __init__(self, source: Path, split: Split, settings: DatasetSettings, seed: int, share: float = 0.5) -> None:
+        require(0 <= share <= 1, "dataset.simulated_share", share, "0..1")
+        super().__init__(split, settings, seed)
+        self.share = share
+        shards = read_clouds(source)
+        self.identity = shards[0].identity
+        self._sizes_m = {name: info.size_m for shard in shards for name, info in shard.objects.items()}
+        mine = [c for shard in shards for c in shard.clouds if shard.objects[c.object].split == split and _usable(c)]
+        here = {name: _is_here(name, settings.objects_dir) for name in {cloud.object for cloud in mine}}
+        self.absent = sorted(name for name, present in here.items() if not present)
+        """Objects whose mesh this machine does not have; their clouds are left out."""
+        enough = [cloud for cloud in mine if here[cloud.object] and len(cloud) >= settings.min_points]
+        self.clouds = enough
+        self._of_label = [[c for c in enough if c.object.startswith(f"{name}/")] for name in CLASSES]
+        if not enough:
+            raise RecordingError(
+                f"{source}: no cloud can be used for {split}",
+                value=f"{len(mine)} clouds of {len(here)} objects, {len(self.absent)} of these not on this machine",
+                action="set RFCONSTRUCT_DATA to the folder that holds objects/, or make a larger set",
+            )
+
+    def __len__(self) -> int:
+        return super().__len__() if self.split == "train" else len(self.clouds)
+
+    @property
+    def description(self) -> dict[str, object]:
+        """What decides the samples beside seed and settings."""
+        data = {"simulated_set": self.identity, "simulated_share": self.share, "simulated_clouds": len(self.clouds)}
+        return super().description | data
+
+    @property
+    def summary(self) -> str:
+        """One line for the user."""
+        left_out = f"; {len(self.absent)} objects are not on this machine" if self.absent else ""
+        objects = len({cloud.object for cloud in self.clouds})
+        return f"{len(self.clouds)} simulated clouds of {objects} objects for {self.split}{left_out}"
+
+    def __getitem__(self, index: int) -> Sample:
+        if not 0 <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        epoch = int(self._epoch[0]) if self.split == "train" else 0
+        rng = np.random.default_rng([self.seed, SPLITS.index(self.split), epoch, index, _OWN])
+        if self.split != "train":
+            return self._seen(self.clouds[index], rng)
+        clouds = self._of_label[index % len(CLASSES)]
+        if clouds and rng.random() < self.share:
+            return self._seen(clouds[rng.integers(len(clouds))], rng)
+        return super().__getitem__(index)
+
+    def _seen(self, cloud: Cloud, rng: np.random.Generator) -> Sample:
+        """A cloud and its truth."""
+        settings = self.settings
+        mesh = self._checked_mesh(cloud.object)
+        count = most = min(len(cloud), settings.max_points)
+        if self.split == "train" and rng.random() < THIN_SHARE:
+            count = round(np.exp(rng.uniform(np.log(min(settings.min_points, most)), np.log(most))))
+        partial = cloud.xyz_m[rng.permutation(len(cloud))[:count]]
+        truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
+        rotation, translation = cloud.rotation.astype(np.float32), cloud.translation_m.astype(np.float32)
+        if settings.box_frame:
+            partial = np.asarray((partial - translation) @ rotation, np.float32)
+        else:
+            truth = truth @ rotation.T + translation
+            partial, truth = self._as_seen(partial, truth, bearing_rad(cloud.object, cloud.sensor_m, partial), rng)
+        if self.split == "train" and rng.random() < MIRROR_SHARE:
+            mirror = np.array([1, -1, 1], np.float32)
+            partial, truth = partial * mirror, truth * mirror
+        return Sample(np.ascontiguousarray(partial), np.ascontiguousarray(truth), mesh.label, cloud.object)
+
+    def _checked_mesh(self, name: str) -> Mesh:
+        mesh = _mesh(name, self.settings.objects_dir)
+        if np.abs(mesh.size_m - np.array(self._sizes_m[name])).max() > _SIZE_TOLERANCE_M:
+            raise MeshError(
+                f"{name}: not the object that the radar saw",
+                value=f"{np.round(mesh.size_m, 3).tolist()} m",
+                allowed=f"{list(self._sizes_m[name])} m",
+                action="use the object library that the set was made with",
+            )
+        return mesh
+
+
+def _usable(cloud: Cloud) -> bool:
+    return cloud.kind == "simulated" and not cloud.error and cloud.status in USABLE
+
+
+def _is_here(name: str, objects_dir: Path | None) -> bool:
+    """Whether the object can be loaded, without loading it."""
+    ref = ObjectRef.from_text(name)
+    person = (ref.generated and ref.generated[0] == "human") or (ref.rider or "").startswith("human")
+    if person and not (objects_dir and (objects_dir / HUMAN_FILE).is_file()):
+        return False
+    try:
+        return ref.generated is not None or (objects_dir is not None and ref.entry(objects_dir).path.is_file())
+    except MeshError:
+        return False
+
+
+@lru_cache(maxsize=256)
+def _mesh(name: str, objects_dir: Path | None) -> Mesh:
+    """An object, kept in memory (some 200 kB each)."""
+    return ObjectRef.from_text(name).mesh(objects_dir)
