@@ -1,25 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contact sheets for the eye: parametric objects as shaded surfaces, and samples of the data set as clouds."""
+"""Contact sheets for the eye: objects as shaded surfaces, and samples of the data set as clouds."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.errors import DependencyError
 from edge.frames import Float32
-from train.dataset import CompletionDataset, DatasetSettings
 from train.depth_scan import project, rasterize
-from train.objects.mesh import CLASSES, Mesh
-from train.objects.parametric import generate
-from train.perturb import PerturbSettings
+from train.objects.mesh import Mesh
 
-mpl.use("Agg")
+if TYPE_CHECKING:
+    from train.dataset import CompletionDataset
 
 
 def shade(mesh: Mesh, position: tuple[float, float, float], columns: int = 320, rows: int = 200) -> NDArray[np.float32]:
@@ -45,10 +43,20 @@ def shade(mesh: Mesh, position: tuple[float, float, float], columns: int = 320, 
     return picture.astype(np.float32)
 
 
-def object_sheet(meshes: Sequence[Mesh], path: Path, columns: int = 4) -> None:
-    """Side and oblique view of every mesh, with its size, as one PNG."""
+def _pyplot() -> Any:
+    try:
+        import matplotlib as mpl
+    except ImportError as error:
+        raise DependencyError("contact sheets need matplotlib", action="pip install 'rfconstruct[plot]'") from error
+    mpl.use("Agg")
     from matplotlib import pyplot as plt
 
+    return plt
+
+
+def object_sheet(meshes: Sequence[Mesh], path: Path, columns: int = 4) -> None:
+    """Side and oblique view of every mesh, with its size, as one PNG."""
+    plt = _pyplot()
     rows = -(-len(meshes) // columns)
     figure, axes = plt.subplots(rows, 2 * columns, figsize=(4 * columns, 1.5 * rows), squeeze=False)
     for axis in axes.ravel():
@@ -70,8 +78,7 @@ def _scatter(axis: Any, points: Float32, color: str, size: float, axes: tuple[in
 
 def sample_sheet(dataset: CompletionDataset, path: Path, count: int = 16) -> None:
     """Truth (grey) and partial cloud (red) of the first samples, from above and from the side, as one PNG."""
-    from matplotlib import pyplot as plt
-
+    plt = _pyplot()
     columns = 4
     rows = -(-count // columns)
     figure, axes = plt.subplots(rows, 2 * columns, figsize=(4 * columns, 2.2 * rows), squeeze=False)
@@ -91,14 +98,15 @@ def sample_sheet(dataset: CompletionDataset, path: Path, count: int = 16) -> Non
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the sheets; returns the exit code."""
+    """Write sheets of samples; returns the exit code. Those of objects: ``rfconstruct-train objects sheet``."""
+    from train.dataset import CompletionDataset, DatasetSettings
+    from train.perturb import PerturbSettings
+
     parser = argparse.ArgumentParser(prog="python -m train.contact_sheet", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for the PNG files")
-    parser.add_argument("--count", type=int, default=16, help="objects of a class, and samples of a sheet")
+    parser.add_argument("--count", type=int, default=16, help="samples of a sheet")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    for name in CLASSES:
-        object_sheet([generate(name, seed) for seed in range(options.count)], options.out / f"parametric_{name}.png")
     settings = DatasetSettings.default()
     sample_sheet(CompletionDataset("train", settings, 0), options.out / "samples_train.png", options.count)
     paper = DatasetSettings.default(perturbation=PerturbSettings.paper(), box_frame=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The library reader, its splits, and the converter of mesh folders."""
+"""The library reader and its splits."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from train.objects.folder import COLUMNS, axes_rotation, main
-from train.objects.library import SPLITS, group_split, person_split, read_manifest
+from train.objects.library import COLUMNS, SPLITS, group_split, person_split, read_manifest
 from train.objects.mesh import CLASSES, MeshError
 
 
@@ -81,53 +80,3 @@ def test_a_library_that_contradicts_itself_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "t.npz", vertices=np.zeros((3, 3)))
     with pytest.raises(MeshError, match="unreadable"):
         read_manifest(tmp_path)[0].load()
-
-
-OBJ = """
-v -0.4 0.0 0.2
-v 0.4 0.0 0.2
-v 0.4 0.0 -0.5
-v 0.4 0.3 0.0
-f 1 2 4
-f 2 3 4
-f 1 2 3
-"""
-
-
-def test_shapenet_axes_and_scale(tmp_path: Path) -> None:
-    """y up, -z forward, unit size: the file's nose at z = -0.5 comes out in front, scaled to 4.5 m."""
-    source, target = tmp_path / "in" / "car" / "someone", tmp_path / "out"
-    source.mkdir(parents=True)
-    (source / "model.obj").write_text(OBJ)
-    arguments = [str(tmp_path / "in"), str(target), "--up=+y", "--forward=-z", "--length", "car=4.5"]
-    assert main([*arguments, "--licence", "CC0-1.0"]) == 0
-    (entry,) = read_manifest(target)
-    mesh = entry.load()
-    assert (mesh.source_group, mesh.licence) == ("someone", "CC0-1.0")
-    scale = 4.5 / 0.7
-    np.testing.assert_allclose(mesh.size_m, [4.5, 0.8 * scale, 0.3 * scale], rtol=1e-5)
-    nose = mesh.vertices[np.argmax(mesh.vertices[:, 0])]
-    assert nose[1] < 0  # the nose was at the file's right (+x)
-    assert mesh.vertices[:, 2].min() == 0
-
-
-@pytest.mark.parametrize("suffix", ["ply", "glb", "off"])
-def test_other_formats(tmp_path: Path, suffix: str) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    folder = tmp_path / "in" / "car"
-    folder.mkdir(parents=True)
-    trimesh.creation.box((4.0, 1.8, 1.5)).export(folder / f"block.{suffix}")
-    assert main([str(tmp_path / "in"), str(tmp_path / "out")]) == 0
-    mesh = read_manifest(tmp_path / "out")[0].load()
-    np.testing.assert_allclose(mesh.size_m, [4.0, 1.8, 1.5], rtol=1e-5)
-
-
-def test_unusable_folders_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match="no meshes"):
-        main([str(tmp_path), str(tmp_path / "out")])
-    (tmp_path / "car").mkdir()
-    (tmp_path / "car" / "broken.ply").write_text("nonsense")
-    with pytest.raises(MeshError, match=r"broken\.ply"):
-        main([str(tmp_path), str(tmp_path / "out")])
-    with pytest.raises(MeshError, match="right angles"):
-        axes_rotation("+x", "-x")

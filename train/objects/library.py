@@ -18,6 +18,8 @@ from train.objects.mesh import CLASSES, Mesh, MeshError
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
+COLUMNS = ("class", "name", "file", "licence", "attribution", "provenance_grade", "source_group")
+"""Of the manifest; more are allowed."""
 PROCEDURAL = "P"
 _SPLIT_KEY = "split-26168"
 """Hashed together with the group's name; chosen once so that every class has collected objects in every split."""
