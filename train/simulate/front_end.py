@@ -17,7 +17,7 @@ from edge.calibration import Calibration, Waveform
 from edge.config import require
 from edge.dsp.tables import curvature_m
 from edge.frames import RADARS, Complex64, Float32, Float64, Int16
-from train.simulate.kernels_front_end import compose, digitise
+from train.simulate.kernels_front_end import digitise
 
 if TYPE_CHECKING:
     from edge.rig import Radar
@@ -255,15 +255,12 @@ class FrontEnd:
         rate_hz = self.radar.schedule.profile.sample_rate_hz
         return math.sqrt(0.5 * density_hz * rate_hz) * rng.standard_normal((self._slots, self._samples))
 
-    def compose(self, lines: Complex64, correction: Float32, signal: Complex64) -> None:
-        """Noise-free samples of one loop as the ADC sees them.
+    def distort(self, signal: Complex64) -> None:
+        """Second harmonic and IQ image of what reaches the ADC.
 
         Args:
-            lines: complex64 [chips, slots, cells * rx], sample i of the window at cell i - samples / 2.
-            correction: float32 [samples * rx].
-            signal: complex64 [chips, slots, samples * rx], overwritten.
+            signal: complex64 [chips, slots, samples * rx], changed.
         """
-        compose(lines, correction, self.response, self.leakage, signal)
         if self.settings.second_harmonic_dbc is not None:
             factor = math.pow(10.0, self.settings.second_harmonic_dbc / 20.0) / FULL_SCALE_LSB
             signal += np.float32(factor) * signal * signal
@@ -275,7 +272,7 @@ class FrontEnd:
         """Add the noise of one loop and round.
 
         Args:
-            signal: complex64 [chips, slots, samples * rx] of ``compose``.
+            signal: complex64 [chips, slots, samples * rx], without noise.
             number, loop: decide the noise, with seed and radar.
             adc: int16 [chips, loops, slots, samples * rx * 2], this loop is overwritten.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the receiver: channel mismatch and leakage, and noise that a counter alone decides, rounded to int16.
+"""Kernel of the ADC: noise that a counter alone decides, rounded to int16.
 
 The generator is Philox 4x32 with 7 rounds (Salmon, Moraes, Dror, Shaw, Parallel random numbers: as easy as 1, 2, 3,
 SC 2011), the transform Box and Muller's: every sample of every frame can be made again alone.
@@ -90,26 +90,3 @@ def digitise(signal, deviation, key_low, key_high, frame, loop, adc):  # type: i
                 codes[second] = _code(line[second] + sigma[second] * n1)
                 codes[third] = _code(line[third] + sigma[third] * n2)
                 codes[fourth] = _code(line[fourth] + sigma[fourth] * n3)
-
-
-@njit(**OPTIONS)
-def compose(lines, correction, response, leakage, signal):  # type: ignore[no-untyped-def]
-    """Synthesised lines through the channels: signal = line * correction * response + leakage.
-
-    Args:
-        lines: complex64 [chips, slots, cells * rx], sample i of the window at cell i - samples / 2.
-        correction: float32 [samples * rx].
-        response, leakage: complex64 [chips, slots, samples * rx].
-        signal: complex64 [chips, slots, samples * rx], overwritten.
-    """
-    half = uint64(signal.shape[2] // 2)
-    late = uint64(lines.shape[2]) - half
-    for chip in range(signal.shape[0]):
-        for slot in range(signal.shape[1]):
-            line, gain = lines[chip, slot], response[chip, slot]
-            leak, out = leakage[chip, slot], signal[chip, slot]
-            for i in range(half):
-                out[i] = line[late + i] * correction[i] * gain[i] + leak[i]
-            for i in range(half):
-                after = half + i
-                out[after] = line[i] * correction[after] * gain[after] + leak[after]

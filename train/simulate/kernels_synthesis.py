@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of the synthesis: exact paths to phasors, and phasors with Gaussian weights on an oversampled grid of beats.
 
-A group is four receivers of one chip and one slot; its grid row holds their complex values as eight floats. A Gaussian
-moved by one cell is the same Gaussian times a ratio that itself changes by a constant factor, so the loop over the
-cells multiplies only (L. Greengard, J.-Y. Lee, Accelerating the nonuniform fast Fourier transform, SIAM Review 46,
-2004, eq. 16).
+A group is four receivers of one chip and one slot; its grid is a plane of real and one of imaginary parts [cell, RX].
+Four cells of four receivers are one register of AVX-512. A Gaussian moved by some cells is the same Gaussian times a
+ratio that itself changes by a constant factor, so the loop over the cells only multiplies (L. Greengard, J.-Y. Lee,
+Accelerating the nonuniform fast Fourier transform, SIAM Review 46, 2004, section 3).
+
+With the place of a scatterer at f cells from the middle of its cells, a receiver a cells from its group's mean and a
+lane o cells from its step's middle, the weight exp(-b d^2) of the first step has d = edge + f + a - o. It is a product
+of factors of f, of a - o, and exp(-2 b f (a - o)); the next step's is this times exp(8 b d - 16 b).
 """
 
 from __future__ import annotations
@@ -16,17 +20,17 @@ from typing import Any
 
 import numpy as np
 from numba import float32, int32, njit, uint64
+from numpy.typing import NDArray
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 RX = 4
 """Receivers of one group."""
-LANES = 2 * RX
-"""Floats of one grid row: I and Q of every receiver in turn."""
-PAIR = 2 * LANES
-"""Floats of two neighbouring rows, which are written together: as many as one register of AVX-512 holds."""
-LEG = 4 * PAIR
-"""Floats of one scatterer's receive leg: phasor, phasor times j, weight's exponent, weight's ratio."""
+CELLS = 4
+"""Grid cells that are written in one step."""
+LANES = CELLS * RX
+LEG = 4 * LANES
+"""Floats of one scatterer's receive leg: weighted phasor (re, im), exponent of the weight over f, ratio of steps."""
 BLOCK = 32
 """Scatterers of a block: distances are taken receiver by receiver over a block, so that they vectorise."""
 
@@ -47,10 +51,23 @@ def _phasor(turns):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _exp(y):  # type: ignore[no-untyped-def]
-    """exp(y) for |y| < 0.75: Taylor to y^7, error 3e-6 at the ends, 1e-8 at half of them."""
-    p = float32(1 / 120) + y * (float32(1 / 720) + y * float32(1 / 5040))
-    p = float32(1 / 2) + y * (float32(1 / 6) + y * (float32(1 / 24) + y * p))
+    """exp(y) for |y| < 1.1: Taylor to y^9, error 7e-7 at the ends."""
+    p = float32(1 / 5040) + y * (float32(1 / 40320) + y * float32(1 / 362880))
+    p = float32(1 / 24) + y * (float32(1 / 120) + y * (float32(1 / 720) + y * p))
+    p = float32(1 / 2) + y * (float32(1 / 6) + y * p)
     return float32(1) + y * (float32(1) + y * p)
+
+
+def lane_factors(shape: float, width: int) -> NDArray[np.float32]:
+    """Constants of the four cells of a step: of the first step's weight, and of its ratio to the next [2, CELLS].
+
+    Args:
+        shape: of the weights exp(-shape distance^2).
+        width: cells to either side of a scatterer, even.
+    """
+    offset = np.arange(CELLS) - 0.5 * (CELLS - 1)
+    exponents = -shape * np.square(offset) + 2.0 * shape * (width - 2) * offset, -8.0 * shape * offset
+    return np.exp(np.stack(exponents)).astype(np.float32)
 
 
 @njit(**OPTIONS)
@@ -120,28 +137,40 @@ def transmit_legs(  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _write_leg(legs, o, n, work, i, next_level, next_ratio):  # type: ignore[no-untyped-def]
-    """Lanes of receiver n at ``legs[o]``: first for the group's lower, then for its upper cell."""
-    cosine, sine, exponent, ratio = work[0, n, i], work[1, n, i], work[2, n, i], work[3, n, i]
-    for _ in range(2):
-        legs[o + 2 * n], legs[o + 2 * n + 1] = cosine, sine
-        legs[o + PAIR + 2 * n], legs[o + PAIR + 2 * n + 1] = -sine, cosine
-        legs[o + 2 * PAIR + 2 * n], legs[o + 2 * PAIR + 2 * n + 1] = exponent, exponent
-        legs[o + 3 * PAIR + 2 * n], legs[o + 3 * PAIR + 2 * n + 1] = ratio, ratio
-        step = work[4, n, i] * next_level
-        cosine, sine = cosine * step, sine * step
-        exponent, ratio = work[5, n, i], ratio * next_ratio
-        o += LANES
+def _write_legs(legs, first, size, work, b, factors):  # type: ignore[no-untyped-def]
+    """Lanes of a block of scatterers, from cosine, sine, place in the group and exp(b place) of every receiver."""
+    for i in range(size):
+        o = (first + i) * LEG
+        for n in range(RX):
+            cosine, sine, away, rise, fall = work[0, n, i], work[1, n, i], work[2, n, i], work[3, n, i], work[4, n, i]
+            twice = rise * rise
+            level, ratio = fall * fall * fall, twice * twice * twice * twice
+            for c in range(CELLS):
+                lane, weight = o + c * RX + n, level * factors[0, c]
+                legs[lane], legs[lane + LANES] = weight * cosine, weight * sine
+                legs[lane + 2 * LANES] = float32(-2) * b * (away - float32(c) + float32(1.5))
+                legs[lane + 3 * LANES] = ratio * factors[1, c]
+                level *= twice
+
+
+@njit(inline="always")
+def _write_turns(turn, first, size, path, turns_s_per_m):  # type: ignore[no-untyped-def]
+    """Cosines and sines of the turn per slot, in the order of the legs' lanes."""
+    for i in range(size):
+        o = (first + i) * 2 * LANES
+        for n in range(RX):
+            cosine, sine = _phasor(path[1, n, i] * turns_s_per_m)
+            for lane in range(n, LANES, RX):
+                turn[o + lane], turn[o + LANES + lane] = cosine, sine
 
 
 @njit(**OPTIONS)
 def receive_legs(  # type: ignore[no-untyped-def]
-    count, points, velocity, antennas, scale, timing, shape, width, legs, turn, cell, base, reach, path, work
+    count, points, velocity, antennas, scale, timing, shape, edge, factors, legs, turn, cell, base, reach, path, work
 ):
     """Receive phasors with their share of the weights, group by group, and how they turn from slot to slot.
 
-    A leg is its tangent at one instant; the transmit leg carries the common curvature. The weight of a cell is a
-    product of one factor of the scatterer, one of the receiver and one of both.
+    A leg is its tangent at one instant; the transmit leg carries the common curvature.
 
     Args:
         count: scatterers.
@@ -149,17 +178,16 @@ def receive_legs(  # type: ignore[no-untyped-def]
         antennas: float64 [chips, RX, 3].
         scale: cells and turns per metre, metres taken off the path: float64 [3].
         timing: instants of the tangent and of slot 0, time from slot to slot (0: nothing moves): float64 [3].
-        shape, width: of the weights exp(-shape distance^2); the first cell lies ``width`` below the nearest.
+        shape, edge: float32; of the weights, and distance from a scatterer to the first step's middle.
+        factors: float32 [2, CELLS], of ``lane_factors``.
         legs: float32 [chips, capacity * LEG], overwritten: state at slot 0.
-        turn: float32 [chips, capacity * 2 * PAIR], overwritten: cosine and sine of the turn per slot.
+        turn: float32 [chips, capacity * 2 * LANES], overwritten: cosine and sine of the turn per slot.
         cell: float32 [2, chips, capacity], overwritten: middle of the group's cells less ``base``, change per second.
         base: int32 [capacity], overwritten.
         reach: float64 [2, capacity], overwritten: shortest and longest leg.
-        path, work: float64 [2, RX, BLOCK] and float32 [6, RX, BLOCK], scratch.
+        path, work: float64 [2, RX, BLOCK] and float32 [5, RX, BLOCK], scratch.
     """
-    b, edge = float32(shape), float32(width)
-    offset_m, middle_s, back_s, slot_s = scale[2], timing[0], timing[0] - timing[1], timing[2]
-    next_level, next_ratio = float32(math.exp(shape * (2.0 * width - 1.0))), float32(math.exp(-4.0 * shape))
+    middle_s, back_s, slot_s = timing[0], timing[0] - timing[1], timing[2]
     for first in range(0, count, BLOCK):
         size = min(BLOCK, count - first)
         for d in range(len(antennas)):
@@ -180,114 +208,93 @@ def receive_legs(  # type: ignore[no-untyped-def]
             for i in range(size):
                 mean_m = 0.25 * (path[0, 0, i] + path[0, 1, i] + path[0, 2, i] + path[0, 3, i])
                 mean_m_s = 0.25 * (path[1, 0, i] + path[1, 1, i] + path[1, 2, i] + path[1, 3, i])
-                cell[0, d, first + i] = float32((mean_m - offset_m) * scale[0] - base[first + i])
+                cell[0, d, first + i] = float32((mean_m - scale[2]) * scale[0] - base[first + i])
                 cell[1, d, first + i] = float32(mean_m_s * scale[0])
                 for n in range(RX):
                     work[2, n, i] = float32((path[0, n, i] - mean_m) * scale[0])
             for n in range(RX):
                 for i in range(size):
                     away = work[2, n, i]
-                    level = _exp(-b * away * (away + float32(2) * edge))
-                    cosine, sine = _phasor((path[0, n, i] - path[1, n, i] * back_s - offset_m) * scale[1])
+                    level = _exp(-shape * away * (away + float32(2) * edge))
+                    cosine, sine = _phasor((path[0, n, i] - path[1, n, i] * back_s - scale[2]) * scale[1])
                     work[0, n, i], work[1, n, i] = level * cosine, level * sine
-                    rise = _exp(float32(2) * b * away)
-                    work[2, n, i], work[5, n, i] = float32(-2) * b * away, float32(-2) * b * (away - float32(1))
-                    work[3, n, i], work[4, n, i] = rise * rise, rise
-            for i in range(size):
-                for n in range(RX):
-                    _write_leg(legs[d], (first + i) * LEG, n, work, i, next_level, next_ratio)
+                    work[3, n, i], work[4, n, i] = _exp(shape * away), _exp(-shape * away)
+            _write_legs(legs[d], first, size, work, shape, factors)
             if slot_s > 0.0:
                 _write_turns(turn[d], first, size, path, slot_s * scale[1])
 
 
 @njit(inline="always")
-def _write_turns(turn, first, size, path, turns_s_per_m):  # type: ignore[no-untyped-def]
-    """Cosines and sines of the turn per slot, in the order of the legs' lanes."""
-    for i in range(size):
-        o = (first + i) * 2 * PAIR
-        for n in range(RX):
-            cosine, sine = _phasor(path[1, n, i] * turns_s_per_m)
-            for lane in range(2 * n, PAIR, LANES):
-                turn[o + lane], turn[o + lane + 1] = cosine, cosine
-                turn[o + PAIR + lane], turn[o + PAIR + lane + 1] = sine, sine
-
-
-@njit(**OPTIONS)
-def turn_legs(count, legs, turn):  # type: ignore[no-untyped-def]
-    """Receive phasors of one group to the next slot.
-
-    Args:
-        count: scatterers.
-        legs: float32 [capacity * LEG], changed.
-        turn: float32 [capacity * 2 * PAIR].
-    """
-    pair, leg, both = uint64(PAIR), uint64(LEG), uint64(2 * PAIR)
-    for k in range(uint64(count)):
-        for n in range(pair):
-            value, by_j = legs[k * leg + n], legs[k * leg + pair + n]
-            cosine, sine = turn[k * both + n], turn[k * both + pair + n]
-            legs[k * leg + n] = cosine * value + sine * by_j
-            legs[k * leg + pair + n] = cosine * by_j - sine * value
+def _plan(count, phasor, cell_out, mean, drift, base, width, b, outer, first_ratio, plan, start):  # type: ignore[no-untyped-def]
+    """First cell of every scatterer, place from its middle, and what it brings to the weights of one group."""
+    for k in range(count):
+        place = cell_out[k] + mean[k] + drift[k]
+        below = np.floor(place)
+        away = place - below - float32(0.5)
+        start[k] = (base[k] + int32(below) - int32(width - 1)) * RX
+        falling, rising = _exp(float32(-2) * b * away), _exp(float32(2) * b * away)
+        level = outer * _exp(-b * away * away)
+        for _ in range(width - 2):
+            level *= falling
+        rising *= rising
+        plan[0, k] = away
+        plan[1, k], plan[2, k] = phasor[0, k] * level, phasor[1, k] * level
+        plan[3, k] = first_ratio * rising * rising
 
 
 @cache
-def spreader(width: int, shape: float) -> Callable[..., None]:
-    """Kernel that adds scatterers to one group's grid, two cells at a time.
+def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[..., None]:
+    """Kernel that adds scatterers to the grids of all groups.
 
     Args:
-        width: the first of 2 width + 2 cells lies this far below the nearest.
+        width: cells to either side of a scatterer, even.
         shape: of the weights exp(-shape distance^2).
+        plane: floats of one plane of a group's grid.
+        moving: turn the legs from slot to slot.
     Returns:
-        Kernel of (count, phasor [2, capacity], cell_out [capacity], cell_back [capacity], drift [capacity], time_s,
-        base_out, base_back int32 [capacity], legs [capacity * LEG], margin, plan float32 [4, capacity], start int32
-        [capacity], grid float32 [rows * LANES]).
+        Kernel of (count, phasor [slots, 2, capacity], cell_out [slots, capacity], cell_back [2, chips, capacity],
+        time_s [slots] from the tangent's instant, base int32 [capacity], legs [chips, capacity * LEG], turn [chips,
+        capacity * 2 * LANES], drift float32 [capacity], plan float32 [4, capacity], start int32 [capacity], grid
+        float32 [chips * slots * 2 * plane]), the last three scratch, the grid added to.
     """
-    steps, lanes = np.uint64(width + 1), np.uint64(PAIR)
-    two, three, leg_size = np.uint64(2 * PAIR), np.uint64(3 * PAIR), np.uint64(LEG)
-    b, edge = np.float32(shape), np.float32(math.exp(-shape * width * width))
-    first_ratio, bend = np.float32(math.exp(4.0 * shape * (width - 1))), np.float32(math.exp(-8.0 * shape))
+    steps, lanes, imaginary = np.uint64(width // 2), np.uint64(LANES), np.uint64(plane)
+    two, three, leg_size = np.uint64(2 * LANES), np.uint64(3 * LANES), np.uint64(LEG)
+    edge = width - 2
+    b, outer = np.float32(shape), np.float32(math.exp(-shape * edge * edge))
+    first_ratio = np.float32(math.exp(8.0 * shape * edge - 16.0 * shape))
+    bend = np.float32(math.exp(-32.0 * shape))
 
     @njit(**OPTIONS)
-    def spread(  # type: ignore[no-untyped-def]
-        count, phasor, cell_out, cell_back, drift, time_s, base_out, base_back, legs, margin, plan, start, grid
-    ):
-        t = float32(time_s)
-        for k in range(count):
-            place = cell_out[k] + cell_back[k] + drift[k] * t
-            nearest = np.floor(place + float32(0.5))
-            away = place - nearest
-            start[k] = (base_out[k] + base_back[k] + int32(nearest) + margin - width) * LANES
-            falling, rising = _exp(float32(-2) * b * away), _exp(float32(2) * b * away)
-            level = edge * _exp(-b * away * away)
-            for _ in range(width):
-                level *= falling
-            plan[0, k] = away
-            plan[1, k], plan[2, k] = phasor[0, k] * level, phasor[1, k] * level
-            plan[3, k] = first_ratio * rising * rising
-        for k in range(count):
-            away, re, im, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
-            o, leg = uint64(start[k]), uint64(k) * leg_size
-            for n in range(lanes):
-                value = (re * legs[leg + n] + im * legs[leg + lanes + n]) * _exp(away * legs[leg + two + n])
-                step = ratio * legs[leg + three + n]
-                for j in range(steps):
-                    grid[o + lanes * j + n] += value
-                    value *= step
-                    step *= bend
+    def spread(count, phasor, cell_out, cell_back, time_s, base, legs, turn, drift, plan, start, grid):  # type: ignore[no-untyped-def]
+        slots, begin = len(time_s), uint64(0)
+        for chip in range(len(legs)):
+            leg_table, turns = legs[chip], turn[chip]
+            mean, rate = cell_back[0, chip], cell_back[1, chip]
+            for slot in range(slots):
+                t = float32(time_s[slot])
+                for k in range(count):
+                    drift[k] = rate[k] * t
+                _plan(count, phasor[slot], cell_out[slot], mean, drift, base, width, b, outer, first_ratio, plan, start)
+                for k in range(uint64(count)):
+                    away, a, c, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
+                    o, leg = begin + uint64(start[k]), k * leg_size
+                    for n in range(lanes):
+                        weight = _exp(away * leg_table[leg + two + n])
+                        step = ratio * leg_table[leg + three + n]
+                        cosine, sine = leg_table[leg + n], leg_table[leg + lanes + n]
+                        re, im = (a * cosine - c * sine) * weight, (a * sine + c * cosine) * weight
+                        for j in range(steps):
+                            grid[o + lanes * j + n] += re
+                            grid[o + imaginary + lanes * j + n] += im
+                            re *= step
+                            im *= step
+                            step *= bend
+                    if moving:
+                        for n in range(lanes):
+                            re, im = leg_table[leg + n], leg_table[leg + lanes + n]
+                            cosine, sine = turns[k * two + n], turns[k * two + lanes + n]
+                            leg_table[leg + n] = re * cosine - im * sine
+                            leg_table[leg + lanes + n] = re * sine + im * cosine
+                begin += imaginary + imaginary
 
     return spread  # type: ignore[no-any-return]
-
-
-@njit(**OPTIONS)
-def fold(grid, margin, cells):  # type: ignore[no-untyped-def]
-    """Rows before the first beat cell are the last ones of the period.
-
-    Args:
-        grid: float32 [groups, rows, LANES], changed.
-        margin: rows before cell 0.
-        cells: of the period.
-    """
-    for g in range(grid.shape[0]):
-        for r in range(margin):
-            for n in range(LANES):
-                grid[g, r + cells, n] += grid[g, r, n]

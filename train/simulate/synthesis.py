@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import require
+from edge.dsp.buffers import zeros
 from edge.errors import RfconstructError
 from edge.frames import Complex64, Float32, Float64, Int16, Layout, RadarFrame
 from edge.reference.point_targets import element_positions_m
@@ -23,26 +24,27 @@ from train.simulate.kernels_synthesis import (
     BLOCK,
     LANES,
     LEG,
-    PAIR,
     RX,
     filter_amplitudes,
-    fold,
+    lane_factors,
     receive_legs,
     spreader,
     transmit_legs,
-    turn_legs,
 )
+from train.simulate.kernels_transform import PARTS, row_of_block, transformer, twiddles
 from train.simulate.scatterers import GroundPlane, Scatterers
 
 if TYPE_CHECKING:
     from edge.rig import Radar
     from train.simulate.front_end import FrontEnd
 
-SHAPES = {3: 0.60, 4: 0.52, 5: 0.44, 6: 0.38}
+SHAPES = {4: 0.56, 6: 0.38}
 """By width: b of the weights exp(-b distance^2), balanced between cut tails and images, found by a sweep."""
-GROUP_CELLS = 0.3
+GROUP_CELLS = 0.2
 """A group's receivers may lie this far from their middle, in grid cells of path."""
 FEWEST_SAMPLES = 64
+MARGIN = 16
+"""Grid rows before the cell of range 0."""
 FIRST_ROOM = 1024
 
 
@@ -68,6 +70,8 @@ class _Work:
     cell_back: Float32
     base_back: NDArray[np.int32]
     reach_back: Float64
+    base: NDArray[np.int32]
+    drift: Float32
     plan: Float32
     start: NDArray[np.int32]
 
@@ -85,11 +89,13 @@ class _Work:
             cell_out=np.zeros((slots, room), f4),
             base_out=np.zeros(room, np.int32),
             reach_out=np.zeros((2, room), f8),
-            legs=np.zeros((chips, room * LEG), f4),
-            turn=np.zeros((chips, room * 2 * PAIR), f4),
+            legs=zeros((chips, room * LEG), f4),
+            turn=zeros((chips, room * 2 * LANES), f4),
             cell_back=np.zeros((2, chips, room), f4),
             base_back=np.zeros(room, np.int32),
             reach_back=np.zeros((2, room), f8),
+            base=np.zeros(room, np.int32),
+            drift=np.zeros(room, f4),
             plan=np.zeros((4, room), f4),
             start=np.zeros(room, np.int32),
         )
@@ -100,14 +106,14 @@ class Synthesizer:
 
     Args:
         radar: board, schedule, mounting; its calibration is not used.
-        width: grid cells to either side of a scatterer, 3 to 6; every one more lowers the error by about 15 dB.
+        width: grid cells to either side of a scatterer: 4 (error about -85 dB) or 6 (about -110 dB).
     Raises:
         ConfigError: width out of range, fewer than 64 samples, or receivers of one chip too far apart for this
             bandwidth.
     """
 
     def __init__(self, radar: Radar, width: int = 4) -> None:
-        require(width in SHAPES, "synthesis.width", width, f"{min(SHAPES)}..{max(SHAPES)}")
+        require(width in SHAPES, "synthesis.width", width, ", ".join(map(str, SHAPES)))
         self.radar, self.width = radar, width
         layout, profile = radar.schedule.layout, radar.schedule.profile
         require(layout.samples >= FEWEST_SAMPLES, "samples", layout.samples, f">= {FEWEST_SAMPLES}")
@@ -115,31 +121,36 @@ class Synthesizer:
         self.reach_m = profile.usable_range_m
         """Largest half path, as measured by the radar, of a scatterer that is accepted."""
         self._layout: Layout = layout
-        self._cells = 2 * layout.samples
-        self._margin = width + 2
-        slope_per_m = profile.slope_hz_per_s_actual / SPEED_OF_LIGHT_M_S
-        self._scale = np.zeros(2 + layout.slots)
-        self._scale[:2] = slope_per_m * self._cells / profile.sample_rate_hz, 1.0 / profile.wavelength_m
-        self._jitter_turns_per_m_s = 2.0 * slope_per_m
-        self._offset_m = 2.0 * radar.mounting.range_offset_m
+        self._cells = cells = 1 << (2 * layout.samples - 1).bit_length()
         self._transmitters_m, receivers_m = element_positions_m(radar)
         self._receivers_m = np.ascontiguousarray(receivers_m.reshape(-1, RX, 3))
         self._centre_m = np.asarray(radar.mounting.position_m, dtype=np.float64)
+        first = PARTS * (layout.samples // (2 * PARTS))
+        lead_s = (first - layout.samples / 2) / profile.sample_rate_hz
+        slope_per_m = profile.slope_hz_per_s_actual / SPEED_OF_LIGHT_M_S
+        frequency_hz = profile.center_frequency_hz + profile.slope_hz_per_s_actual * lead_s
+        self._cells_per_m = slope_per_m * cells / profile.sample_rate_hz
+        self._turns_per_m, self._offset_m = frequency_hz / SPEED_OF_LIGHT_M_S, 2.0 * radar.mounting.range_offset_m
+        self._jitter_turns_per_m_s = 2.0 * slope_per_m
         spread_m = np.linalg.norm(self._receivers_m - self._receivers_m.mean(axis=1, keepdims=True), axis=2).max()
-        spread_cells = float(spread_m * self._scale[0])
-        require(spread_cells <= GROUP_CELLS, "receivers of one chip, apart in cells", spread_cells, f"<= {GROUP_CELLS}")
-        self._slot_s = profile.chirp_time_s
-        self._spread = spreader(width, SHAPES[width])
-        chips = len(self._receivers_m)
-        self._grid = np.zeros((chips, layout.slots, self._cells + self._margin, LANES), dtype=np.float32)
-        self._lines = np.zeros((chips, layout.slots, self._cells, RX), dtype=np.complex64)
-        self._signal = np.zeros((chips, layout.slots, layout.samples * RX), dtype=np.complex64)
-        self._correction = _correction(SHAPES[width], layout.samples, self._cells)
-        self._no_filter = self._response = np.ones(self._cells + 1, dtype=np.complex64)
+        apart = float(spread_m * self._cells_per_m)
+        require(apart <= GROUP_CELLS, "distance of one chip's receivers in cells", apart, f"<= {GROUP_CELLS}")
+        chips, shape = len(self._receivers_m), SHAPES[width]
+        plane = (cells + MARGIN) * RX
+        self._spread = {moving: spreader(width, shape, plane, moving) for moving in (False, True)}
+        self._transform = transformer(cells, layout.samples, MARGIN)
+        self._twiddles, self._row_of = twiddles(cells), row_of_block(cells)
+        self._factors = lane_factors(shape, width)
+        self._grid = zeros(chips * layout.slots * 2 * plane)
+        self._columns = zeros(2 * cells * RX)
+        self._signal = zeros((chips, layout.slots, layout.samples * RX), np.complex64)
+        index = np.arange(layout.samples) - first
+        inverse = np.sqrt(shape / np.pi) * np.exp(np.square(np.pi * index / cells) / shape)
+        self._correction = np.repeat(inverse, RX).astype(np.float32)
+        self._unfiltered = self._response = np.ones(cells + 1, dtype=np.complex64)
         self._filtered_by: FrontEnd | None = None
-        self._moving = False
-        self._path = np.zeros((2, RX, BLOCK))
-        self._scratch = np.zeros((6, RX, BLOCK), dtype=np.float32)
+        self._moving, self._slot_s = False, profile.chirp_time_s
+        self._path, self._scratch = np.zeros((2, RX, BLOCK)), zeros((5, RX, BLOCK))
         self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
         self._beat: Complex64 | None = None
 
@@ -156,115 +167,19 @@ class Synthesizer:
             RangeError: a scatterer beyond ``reach_m``, or nearer than the board's range offset.
             ConfigError: ground paths without a ground.
         """
-        layout = self._layout
+        layout, chips = self._layout, len(self._receivers_m)
         loops = layout.loops if scatterers.velocity_m_s.any() else 1
-        shape = (loops, layout.slots, layout.devices * RX, layout.samples)
+        shape = (loops, layout.slots, chips * RX, layout.samples)
         if self._beat is None or len(self._beat) != loops:
             self._beat = np.empty(shape, dtype=np.complex64)
-        self._place(scatterers, ground, self._no_filter)
+        self._place(scatterers, ground, self._unfiltered)
+        ones, nothing = np.ones_like(self._signal), np.zeros_like(self._signal)
         for loop in range(loops):
-            lines = self._synthesize(len(scatterers), loop)
-            half = layout.samples // 2
-            samples = np.concatenate((lines[:, :, -half:], lines[:, :, : layout.samples - half]), axis=2)
-            samples *= self._correction.reshape(-1, RX)
+            self._grid_loop(len(scatterers), loop, None)
+            self._to_samples(ones, nothing, self._signal)
+            samples = self._signal.reshape(chips, layout.slots, layout.samples, RX)
             self._beat[loop] = samples.transpose(1, 0, 3, 2).reshape(shape[1:])
         return self._beat if loops > 1 else np.broadcast_to(self._beat, (layout.loops, *shape[1:]))
-
-    def _place(self, scatterers: Scatterers, ground: GroundPlane | None, response: Complex64) -> None:
-        """Take over the scatterers: mirrored legs, curvature of moving paths, receiver's response."""
-        k = len(scatterers)
-        if k > self._work.room:
-            self._work = _Work.make(1 << (k - 1).bit_length(), self._layout.slots, len(self._receivers_m))
-        work = self._work
-        for leg, image in enumerate((scatterers.tx_image, scatterers.rx_image)):
-            work.points[leg, :, :k] = scatterers.position_m.T
-            work.velocity[leg, :, :k] = scatterers.velocity_m_s.T
-            if image.any():
-                require(ground is not None, "ground", None, "the plane that the ground paths are mirrored in")
-                assert ground is not None
-                work.points[leg, :, :k][:, image] = ground.mirrored(scatterers.position_m[image]).T
-                along = scatterers.velocity_m_s[image] @ ground.normal
-                mirrored = scatterers.velocity_m_s[image] - 2.0 * along[:, None] * ground.normal
-                work.velocity[leg, :, :k][:, image] = mirrored.T
-        scale_m = float(self._scale[0])
-        filter_amplitudes(
-            *(k, work.points, scatterers.amplitude, self._centre_m, scale_m, self._offset_m, response, work.amplitude)
-        )
-        work.bend[:k] = 0.0
-        self._moving = bool(scatterers.velocity_m_s.any())
-        if self._moving:
-            away_m = work.points[1, :, :k] - self._centre_m[:, None]
-            range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
-            velocity = work.velocity[1, :, :k]
-            radial = (velocity * away_m).sum(axis=0) / range_m
-            work.bend[:k] = 0.5 * (np.square(velocity).sum(axis=0) - np.square(radial)) / range_m
-
-    def _synthesize(self, k: int, loop: int, front_end: FrontEnd | None = None, number: int = 0) -> Complex64:
-        """Inverse FFT of one loop [chips, slots, cells, RX], sample i of the window at cell i - samples / 2."""
-        work, slots = self._work, self._layout.slots
-        time_s = (loop * slots + np.arange(slots)) * self._slot_s
-        middle_s = float(time_s.mean())
-        jitter_s = None if front_end is None else front_end.jitter_s(number, loop)
-        self._scale[2:] = 0.0 if jitter_s is None else jitter_s * self._jitter_turns_per_m_s
-        transmit_legs(
-            *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
-            *(self._scale, work.phasor, work.cell_out, work.base_out, work.reach_out),
-        )
-        first_s = float(time_s[0])
-        timing = np.array([middle_s, first_s, self._slot_s if self._moving else 0.0])
-        scale = np.array([self._scale[0], self._scale[1], self._offset_m])
-        receive_legs(
-            *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing, SHAPES[self.width], self.width),
-            *(work.legs, work.turn, work.cell_back, work.base_back, work.reach_back, self._path, self._scratch),
-        )
-        self._require_reach(k)
-        self._grid[:] = 0.0
-        for chip in range(len(self._receivers_m)):
-            for slot in range(slots):
-                self._spread(
-                    *(k, work.phasor[slot], work.cell_out[slot], work.cell_back[0, chip], work.cell_back[1, chip]),
-                    *(float(time_s[slot]) - middle_s, work.base_out, work.base_back, work.legs[chip], self._margin),
-                    *(work.plan, work.start, self._grid[chip, slot].reshape(-1)),
-                )
-                if self._moving and slot + 1 < slots:
-                    turn_legs(k, work.legs[chip], work.turn[chip])
-        fold(self._grid.reshape(-1, *self._grid.shape[2:]), self._margin, self._cells)
-        spectrum = self._grid[:, :, self._margin :].view(np.complex64)
-        np.fft.ifft(spectrum, axis=2, norm="forward", out=self._lines)  # type: ignore[arg-type]
-        frequency_hz = None if front_end is None else front_end.frequency_noise_hz(number, loop)
-        if frequency_hz is not None:
-            self._add_phase_noise(spectrum, frequency_hz)
-        return self._lines
-
-    def _add_phase_noise(self, spectrum: Complex64, frequency_hz: Float64) -> None:
-        """Lines times 1 + j 2 pi tau nu: the delay tau of an echo is its cell on the grid.
-
-        Args:
-            spectrum: complex64 [chips, slots, cells, RX].
-            frequency_hz: nu, float64 [slots, samples].
-        """
-        profile = self.radar.schedule.profile
-        delay_s = np.arange(self._cells) * profile.sample_rate_hz / (profile.slope_hz_per_s_actual * self._cells)
-        delayed = np.fft.ifft(spectrum * delay_s[:, None].astype(np.float32), axis=2, norm="forward")
-        place = (np.arange(self._layout.samples) - self._layout.samples // 2) % self._cells
-        turn = (2j * np.pi * frequency_hz).astype(np.complex64)
-        self._lines[:, :, place] += turn[:, :, None] * delayed[:, :, place]
-
-    def _require_reach(self, k: int) -> None:
-        """Refuse scatterers whose beat lies outside of what the receiver passes."""
-        work = self._work
-        nearest_m = 0.5 * (work.reach_out[0, :k] + work.reach_back[0, :k] - self._offset_m)
-        farthest_m = 0.5 * (work.reach_out[1, :k] + work.reach_back[1, :k] - self._offset_m)
-        bad = ~((nearest_m >= 0.0) & (farthest_m <= self.reach_m))
-        if bad.any():
-            index = int(np.argmax(bad))
-            place = ", ".join(f"{value:.3f}" for value in work.points[1, :, index])
-            raise RangeError(
-                f"{self.radar.radar} radar: scatterer {index} at ({place}) m lies outside of what the receiver passes",
-                value=float(farthest_m[index]),
-                allowed=f"half paths of 0 to {self.reach_m:.3f} m",
-                action="leave scatterers beyond Synthesizer.reach_m out",
-            )
 
     def frame(
         self,
@@ -289,31 +204,117 @@ class Synthesizer:
         layout, chips = self._layout, len(self._receivers_m)
         adc = np.empty(layout.shape, dtype=np.int16) if out is None else out
         direct = layout.kind == "cascade" and layout.iq_order == "IQ"
-        shape = (chips, layout.loops, layout.slots, layout.samples * LANES)
+        shape = (chips, layout.loops, layout.slots, layout.samples * 2 * RX)
         codes = adc.reshape(shape) if direct else np.empty(shape, dtype=np.int16)
-        self._place(scatterers, ground, self._filter(front_end))
-        changing = self._moving or front_end.per_chirp
+        if self._filtered_by is not front_end:
+            self._filtered_by, self._response = front_end, front_end.if_response(self._cells)
+        self._place(scatterers, ground, self._response)
         for loop in range(layout.loops):
-            if loop == 0 or changing:
-                lines = self._synthesize(len(scatterers), loop, front_end, number)
-                front_end.compose(lines.reshape(chips, layout.slots, -1), self._correction, self._signal)
+            if loop == 0 or self._moving or front_end.per_chirp:
+                self._grid_loop(len(scatterers), loop, front_end.jitter_s(number, loop))
+                self._through(front_end, front_end.frequency_noise_hz(number, loop))
             front_end.digitise(self._signal, number, loop, codes)
         if not direct:
             _reorder(codes, layout, adc)
         return RadarFrame(self.radar.radar, number, t_first_chirp_ns, adc, layout)
 
-    def _filter(self, front_end: FrontEnd) -> Complex64:
-        """The IF's response, kept while the front end is the same."""
-        if self._filtered_by is not front_end:
-            self._filtered_by, self._response = front_end, front_end.if_response(self._cells)
-        return self._response
+    def _through(self, front_end: FrontEnd, frequency_hz: Float64 | None) -> None:
+        """Grid to the samples that the ADC sees, but for their noise.
 
+        With phase noise an echo is multiplied by 1 + j 2 pi tau nu; its delay tau is its cell on the grid.
+        """
+        if frequency_hz is None:
+            self._to_samples(front_end.response, front_end.leakage, self._signal)
+        else:
+            profile, slots = self.radar.schedule.profile, self._layout.slots
+            cell_s = profile.sample_rate_hz / (profile.slope_hz_per_s_actual * self._cells)
+            delay_s = np.repeat((np.arange(self._cells + MARGIN) - MARGIN) * cell_s, RX).astype(np.float32)
+            delayed = (self._grid.reshape(-1, len(delay_s)) * delay_s).ravel()
+            self._to_samples(front_end.response, front_end.leakage, self._signal)
+            self._grid[:] = delayed
+            late = np.zeros_like(self._signal)
+            self._to_samples(front_end.response, late, late)
+            turn = (2j * np.pi * frequency_hz).astype(np.complex64).reshape(slots, -1)
+            self._signal += np.repeat(turn, RX, axis=1) * late
+        front_end.distort(self._signal)
 
-def _correction(b: float, samples: int, cells: int) -> Float32:
-    """Inverse of the weights' Fourier transform at every sample, for all receivers of a group [samples * RX]."""
-    index = np.arange(samples) - samples // 2
-    inverse = np.sqrt(b / np.pi) * np.exp(np.square(np.pi * index / cells) / b)
-    return np.repeat(inverse, RX).astype(np.float32)
+    def _place(self, scatterers: Scatterers, ground: GroundPlane | None, response: Complex64) -> None:
+        """Take over the scatterers: mirrored legs, curvature of moving paths, receiver's response."""
+        k = len(scatterers)
+        if k > self._work.room:
+            self._work = _Work.make(1 << (k - 1).bit_length(), self._layout.slots, len(self._receivers_m))
+        work = self._work
+        for leg, image in enumerate((scatterers.tx_image, scatterers.rx_image)):
+            work.points[leg, :, :k] = scatterers.position_m.T
+            work.velocity[leg, :, :k] = scatterers.velocity_m_s.T
+            if image.any():
+                require(ground is not None, "ground", None, "the plane that the ground paths are mirrored in")
+                assert ground is not None
+                work.points[leg, :, :k][:, image] = ground.mirrored(scatterers.position_m[image]).T
+                along = scatterers.velocity_m_s[image] @ ground.normal
+                mirrored = scatterers.velocity_m_s[image] - 2.0 * along[:, None] * ground.normal
+                work.velocity[leg, :, :k][:, image] = mirrored.T
+        filter_amplitudes(
+            *(k, work.points, scatterers.amplitude, self._centre_m, self._cells_per_m, self._offset_m, response),
+            work.amplitude,
+        )
+        work.bend[:k] = 0.0
+        self._moving = bool(scatterers.velocity_m_s.any())
+        if self._moving:
+            away_m = work.points[1, :, :k] - self._centre_m[:, None]
+            range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
+            velocity = work.velocity[1, :, :k]
+            radial = (velocity * away_m).sum(axis=0) / range_m
+            work.bend[:k] = 0.5 * (np.square(velocity).sum(axis=0) - np.square(radial)) / range_m
+
+    def _grid_loop(self, k: int, loop: int, jitter_s: Float64 | None) -> None:
+        """Spread the scatterers as one loop sees them."""
+        work, slots = self._work, self._layout.slots
+        time_s = (loop * slots + np.arange(slots)) * self._slot_s
+        middle_s = float(time_s.mean())
+        out_scale = np.zeros(2 + slots)
+        out_scale[:2] = self._cells_per_m, self._turns_per_m
+        if jitter_s is not None:
+            out_scale[2:] = jitter_s * self._jitter_turns_per_m_s
+        transmit_legs(
+            *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
+            *(out_scale, work.phasor, work.cell_out, work.base_out, work.reach_out),
+        )
+        timing = np.array([middle_s, time_s[0], self._slot_s if self._moving else 0.0])
+        scale = np.array([self._cells_per_m, self._turns_per_m, self._offset_m])
+        receive_legs(
+            *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing),
+            *(np.float32(SHAPES[self.width]), np.float32(self.width - 2), self._factors, work.legs, work.turn),
+            *(work.cell_back, work.base_back, work.reach_back, self._path, self._scratch),
+        )
+        self._require_reach(k)
+        self._grid[:] = 0.0
+        work.base[:k] = work.base_out[:k] + work.base_back[:k] + MARGIN
+        self._spread[self._moving](
+            *(k, work.phasor, work.cell_out, work.cell_back, time_s - middle_s, work.base, work.legs, work.turn),
+            *(work.drift, work.plan, work.start, self._grid),
+        )
+
+    def _to_samples(self, response: Complex64, leakage: Complex64, signal: Complex64) -> None:
+        """Transform the grid, which is lost: complex64 [chips, slots, samples * rx] each."""
+        flat = (array.reshape(-1).view(np.float32) for array in (response, leakage, signal))
+        self._transform(self._grid, self._twiddles, self._row_of, self._columns, self._correction, *flat)
+
+    def _require_reach(self, k: int) -> None:
+        """Refuse scatterers whose beat lies outside of what the receiver passes."""
+        work = self._work
+        nearest_m = 0.5 * (work.reach_out[0, :k] + work.reach_back[0, :k] - self._offset_m)
+        farthest_m = 0.5 * (work.reach_out[1, :k] + work.reach_back[1, :k] - self._offset_m)
+        bad = ~((nearest_m >= 0.0) & (farthest_m <= self.reach_m))
+        if bad.any():
+            index = int(np.argmax(bad))
+            place = ", ".join(f"{value:.3f}" for value in work.points[1, :, index])
+            raise RangeError(
+                f"{self.radar.radar} radar: scatterer {index} at ({place}) m lies outside of what the receiver passes",
+                value=float(farthest_m[index]),
+                allowed=f"half paths of 0 to {self.reach_m:.3f} m",
+                action="leave scatterers beyond Synthesizer.reach_m out",
+            )
 
 
 def _reorder(codes: Int16, layout: Layout, adc: Int16) -> None:
