@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The emulated demo on its pseudo-terminal: prompt, answers, refusals, state, and samples through the capture card."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import termios
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.errors import CaptureError
+from edge.frames import Layout, RadarFrame, RadarId
+from train.simulate.dca1000_board import Dca1000Board, Dca1000Settings
+from train.simulate.demo_cli import DemoRadar, DemoSettings
+from train.simulate.faults import Faults
+
+SAFETY_S = 20.0
+PROMPT = b"mmwDemo:/>"
+LAYOUT = Layout("dca1000", 1, 16, 3, 182, 4, "QI")
+CONFIG = """sensorStop
+flushCfg
+dfeDataOutputMode 1
+channelCfg 15 7 0
+adcCfg 2 1
+adcbufCfg -1 0 1 1 1
+lowPower 0 0
+profileCfg 0 77 7 6 50 0 0 70 1 182 6250 0 0 30
+chirpCfg 0 0 0 0 0 0 0 1
+chirpCfg 1 1 0 0 0 0 0 4
+chirpCfg 2 2 0 0 0 0 0 2
+frameCfg 0 2 16 {frames} {period} {trigger} 0
+guiMonitor -1 0 0 0 0 0 0
+cfarCfg -1 0 2 8 4 3 0 100 0
+cfarCfg -1 1 0 4 2 3 1 100 0
+multiObjBeamForming -1 0 0.5
+clutterRemoval -1 0
+calibDcRangeSig -1 0 -5 8 256
+extendedMaxVelocity -1 0
+compRangeBiasAndRxChanPhase 0.0 1 0 1 0 1 0 1 0 1 0 1 0 1 0 1 0 1 0 1 0 1 0 1 0
+measureRangeBiasAndRxChanPhase 0 1.5 0.2
+CQRxSatMonitor 0 3 4 127 0
+CQSigImgMonitor 0 127 4
+analogMonitor 0 0
+aoaFovCfg -1 -90 90 -90 90
+cfarFovCfg -1 0 0 13.38
+cfarFovCfg -1 1 -5.56 5.56
+lvdsStreamCfg -1 0 {lvds} 0
+calibData 0 0 0"""
+
+
+def lines(frames: int = 0, period: float = 16.667, trigger: int = 1, lvds: int = 1) -> list[str]:
+    return CONFIG.format(frames=frames, period=period, trigger=trigger, lvds=lvds).splitlines()
+
+
+def supply(radar: RadarId, number: int) -> RadarFrame:
+    index = np.arange(LAYOUT.int16_count, dtype=np.int64).reshape(LAYOUT.shape)
+    return RadarFrame(radar, number, number, ((index + 7919 * number) % 30_011).astype(np.int16), LAYOUT)
+
+
+class Terminal:
+    """A host's end of the serial line, raw."""
+
+    def __init__(self, path: str) -> None:
+        self.handle = os.open(path, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self.handle)
+        self.text = b""
+
+    def close(self) -> None:
+        os.close(self.handle)
+
+    def until(self, mark: bytes = PROMPT) -> bytes:
+        """Everything up to and including the mark."""
+        end_s = time.monotonic() + SAFETY_S
+        while mark not in self.text:
+            assert select.select([self.handle], [], [], max(0.0, end_s - time.monotonic()))[0], self.text
+            self.text += os.read(self.handle, 4096)
+        place = self.text.index(mark) + len(mark)
+        found, self.text = self.text[:place], self.text[place:]
+        return found
+
+    def ask(self, line: str) -> list[str]:
+        """Send a line; the lines between its echo and the prompt."""
+        os.write(self.handle, line.encode() + b"\n")
+        answer = self.until().decode().removesuffix("mmwDemo:/>").splitlines()
+        assert answer[0] == line, "echo"
+        return answer[1:]
+
+    def silent(self) -> bool:
+        return not self.text and not select.select([self.handle], [], [], 0.05)[0]
+
+
+class Sink:
+    """Takes the samples in place of a card."""
+
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+
+    def __call__(self, data: memoryview, period_s: float) -> None:
+        assert period_s == pytest.approx(16.667e-3)
+        self.frames.append(bytes(data))
+
+
+Make = Callable[..., tuple[DemoRadar, Terminal, Sink]]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    made: list[tuple[DemoRadar, Terminal]] = []
+
+    def make_radar(faults: Faults | None = None, **settings: Any) -> tuple[DemoRadar, Terminal, Sink]:
+        sink = Sink()
+        chosen = DemoSettings(**{"pace": 0.0, "start_s": 0.0, "restart_s": 0.0, "boot_s": 0.0, **settings})
+        radar = DemoRadar("vertical", supply, sink, chosen, faults)
+        terminal = Terminal(radar.port)
+        radar.start()
+        banner = terminal.until()
+        assert banner.count(b"*****") >= 2
+        made.append((radar, terminal))
+        return radar, terminal, sink
+
+    yield make_radar
+    for radar, terminal in made:
+        terminal.close()
+        assert radar.stop(), "threads that do not end"
+
+
+def configure(terminal: Terminal, **changes: Any) -> None:
+    for line in lines(**changes):
+        assert terminal.ask(line)[-1] == "Done", line
+
+
+def eventually(condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + SAFETY_S
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.002)
+
+
+def test_answers_to_every_kind_of_line(make: Make) -> None:
+    radar, terminal, _ = make()
+    assert terminal.ask("sensorStop") == ["Ignored: Sensor is already stopped", "Done"]
+    assert terminal.ask("% a comment") == []
+    assert terminal.ask("") == []
+    assert terminal.ask("sensorHalt") == ["'sensorHalt' is not recognized as a CLI command"]
+    assert terminal.ask("channelCfg 15 7")[-1] == "Error -1"
+    assert terminal.ask("channelCfg 15 x 0")[0].startswith("Error: ")
+    assert terminal.ask("queryDemoStatus")[0] == "Sensor State: 0"
+    assert terminal.ask("x" * 300)[0].endswith("is not recognized as a CLI command")
+    assert radar.lines[0] == "sensorStop"
+    os.write(terminal.handle, b"sensor")
+    assert terminal.until(b"sensor") == b"sensor"
+    os.write(terminal.handle, b"Stop\r\n")
+    assert b"Done" in terminal.until()
+
+
+def test_the_terminal_itself_adds_nothing(make: Make) -> None:
+    radar, terminal, _ = make()
+    attributes = termios.tcgetattr(terminal.handle)
+    assert not attributes[3] & (termios.ECHO | termios.ICANON)
+    assert os.path.exists(radar.port)
+
+
+def test_frames_in_the_configured_layout(make: Make) -> None:
+    radar, terminal, sink = make()
+    configure(terminal, frames=3)
+    assert terminal.ask("sensorStart")[-1] == "Done"
+    eventually(lambda: len(sink.frames) == 3)
+    assert sink.frames == [supply("vertical", k).adc.astype("<i2").tobytes() for k in range(3)]
+    assert terminal.ask("queryDemoStatus")[0] == "Sensor State: 2"
+    assert terminal.ask("sensorStart") == ["Ignored: Sensor is already started", "Done"]
+    assert terminal.ask("profileCfg 0 77 7 6 50 0 0 70 1 182 6250 0 0 30")[-1] == "Error -1"
+    assert terminal.ask("sensorStop") == ["Done"]
+    assert terminal.ask("queryDemoStatus")[0] == "Sensor State: 3"
+    assert terminal.ask("sensorStart 0") == ["Done"]
+    eventually(lambda: len(sink.frames) == 6)
+    assert sink.frames[5] == supply("vertical", 5).adc.astype("<i2").tobytes(), "the drive goes on"
+    configuration = radar.firmware.configuration
+    assert configuration.frame_bytes == 16 * 3 * 4 * 182 * 4 == len(sink.frames[0])
+    assert (configuration.profiles[0].slope_mhz_us, configuration.profiles[0].samples) == (70.0, 182)
+    assert [configuration.chirps[k] for k in range(3)] == [(0, 1), (0, 4), (0, 2)]
+    assert configuration.frame is not None
+    assert (configuration.frame.period_ms, configuration.frame.loops) == (16.667, 16)
+
+
+def test_first_start_needs_the_whole_list(make: Make) -> None:
+    _, terminal, sink = make()
+    assert "profileCfg" in terminal.ask("sensorStart")[0]
+    for line in lines(frames=1):
+        if not line.startswith(("cfarFovCfg -1 1", "analogMonitor")):
+            terminal.ask(line)
+    answer = terminal.ask("sensorStart")
+    assert "cfarFovCfg 1" in answer[0]
+    assert "analogMonitor" in answer[0]
+    assert answer[-1] == "Error -1"
+    assert terminal.ask("sensorStart 0")[-1] == "Error -1"
+    assert sink.frames == []
+
+
+def test_what_cannot_change_after_the_first_start(make: Make) -> None:
+    radar, terminal, _ = make()
+    configure(terminal, frames=1)
+    terminal.ask("sensorStart")
+    terminal.ask("sensorStop")
+    assert terminal.ask("channelCfg 15 7 0") == ["Done"], "the same again is no change"
+    assert terminal.ask("channelCfg 15 5 0")[-1] == "Error -1"
+    assert terminal.ask("lowPower 0 1")[-1] == "Error -1"
+    configure(terminal, frames=1)
+    radar.reset()
+    assert b"*****" in terminal.until()
+    assert terminal.ask("queryDemoStatus")[0] == "Sensor State: 0"
+    assert terminal.ask("channelCfg 15 5 0") == ["Done"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "profileCfg 0 75 7 6 50 0 0 70 1 182 6250 0 0 30",
+        "profileCfg 0 77 7 6 60 0 0 70 1 182 6250 0 0 30",
+        "profileCfg 0 77 7 6 30 0 0 70 1 182 6250 0 0 30",
+        "profileCfg 0 77 7 6 50 0 0 101 1 182 6250 0 0 30",
+        "profileCfg 0 77 7 6 50 0 0 70 1 182 12501 0 0 30",
+        "profileCfg 0 77 7 6 50 0 0 70 1 182 6250 0 0 31",
+        "chirpCfg 0 0 0 0 0 0 0 8",
+        "frameCfg 0 2 8 0 16.667 1 0",
+        "frameCfg 0 2 18 0 16.667 1 0",
+        "frameCfg 0 2 16 0 16.667 3 0",
+        "adcCfg 1 1",
+        "adcbufCfg -1 0 1 0 1",
+        "dfeDataOutputMode 3",
+    ],
+)
+def test_fields_out_of_range(make: Make, line: str) -> None:
+    _, terminal, _ = make()
+    if line.startswith("profileCfg 0 77 7 6 60"):
+        assert terminal.ask(line.replace("70 1", "66 1")) == ["Done"]
+    assert terminal.ask(line)[-1] == "Error -1"
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("frameCfg 0 2 16 0 2.9 1 0", "period"),
+        ("frameCfg 0 2 16 0 4.7 1 0", "duty"),
+        ("frameCfg 0 3 16 0 16.667 1 0", "chirp 3"),
+        ("frameCfg 0 2 128 0 100 1 0", "cube"),
+        ("chirpCfg 2 2 1 0 0 0 0 2", "chirp 2"),
+    ],
+)
+def test_limits_of_the_whole(make: Make, line: str, words: str) -> None:
+    _, terminal, _ = make()
+    configure(terminal)
+    assert terminal.ask(line) == ["Done"]
+    answer = terminal.ask("sensorStart")
+    assert words in answer[0]
+    assert answer[-1] == "Error -1"
+
+
+def test_nothing_is_streamed_without_lvds(make: Make) -> None:
+    radar, terminal, sink = make()
+    configure(terminal, frames=2, lvds=0)
+    terminal.ask("sensorStart")
+    eventually(lambda: radar.bursts == 2)
+    assert sink.frames == []
+    assert any("nothing is streamed" in text for text in radar.firmware.violations)
+
+
+def test_sample_swap_changes_the_order_of_i_and_q(make: Make) -> None:
+    _, terminal, sink = make()
+    configure(terminal, frames=1)
+    terminal.ask("adcbufCfg -1 0 0 1 1")
+    terminal.ask("sensorStart")
+    eventually(lambda: len(sink.frames) == 1)
+    ours = np.frombuffer(sink.frames[0], "<i2").reshape(-1, 4)
+    assert np.array_equal(ours, supply("vertical", 0).adc.reshape(-1, 4)[:, [2, 3, 0, 1]])
+
+
+def test_hardware_trigger(make: Make) -> None:
+    radar, terminal, sink = make()
+    configure(terminal, trigger=2)
+    terminal.ask("sensorStart")
+    assert sink.frames == []
+    for count in (1, 2):
+        radar.pulse()
+        eventually(lambda expected=count: len(sink.frames) == expected)  # type: ignore[misc]
+
+
+def test_faults_of_the_line(make: Make) -> None:
+    faults = Faults(seed=2)
+    _, terminal, _ = make(faults)
+    faults.set("nack", "vertical/cli", times=2)
+    assert [terminal.ask("sensorStop")[-1] for _ in range(3)] == ["Error -1", "Error -1", "Done"]
+    faults.set("drop", "vertical/cli", times=1)
+    os.write(terminal.handle, b"sensorStop\n")
+    assert terminal.until(b"sensorStop\r\n") == b"sensorStop\r\n", "only the echo"
+    assert terminal.silent()
+    faults.set("delay", "vertical/cli", times=1, value=0.02)
+    assert terminal.ask("sensorStop")[-1] == "Done"
+    faults.set("garble", "vertical/cli", times=1, value=4)
+    os.write(terminal.handle, b"sensorStop\n")
+    clean = b"sensorStop\r\nIgnored: Sensor is already stopped\r\nDone\r\nmmwDemo:/>"
+    got = b""
+    while len(got) < len(clean):
+        got += os.read(terminal.handle, 4096)
+    assert sum(bin(a ^ b).count("1") for a, b in zip(got, clean, strict=True)) == 4
+
+
+def test_unplug_and_link(make: Make, tmp_path: Path) -> None:
+    link = tmp_path / "ports" / "vertical"
+    radar, terminal, _ = make(link=link)
+    assert os.path.realpath(link) == os.path.realpath(radar.port)
+    radar.unplug()
+    assert not link.is_symlink()
+    assert radar.port == ""
+    with pytest.raises(OSError, match="Input/output error"):
+        os.write(terminal.handle, b"sensorStop\n")
+    radar.plug()
+    again = Terminal(str(link))
+    try:
+        again.until()
+        assert again.ask("queryDemoStatus")[0] == "Sensor State: 0"
+        radar.plug()
+        assert again.ask("queryDemoStatus")[0] == "Sensor State: 0", "it was in already"
+    finally:
+        again.close()
+
+
+def test_a_reader_that_sleeps_holds_nothing_up(make: Make) -> None:
+    radar, terminal, _ = make()
+    for _ in range(200):
+        os.write(terminal.handle, b"queryDemoStatus\n")
+        time.sleep(0)
+    eventually(lambda: len(radar.lines) >= 100)
+    termios.tcflush(terminal.handle, termios.TCIFLUSH)
+    assert radar.port
+
+
+def test_a_whole_radar_with_its_card() -> None:
+    """Card first, then sensorStart: the samples come back bit by bit over UDP; code 2 resets the radar."""
+    command, data = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    for one in (command, data):
+        one.bind(("127.0.0.1", 0))
+        one.settimeout(SAFETY_S)
+    data.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
+    card = Dca1000Board("vertical", Dca1000Settings(data_target=data.getsockname(), pace=0.0, deaf_s=0.0))
+    radar = DemoRadar("vertical", supply, card.lvds, DemoSettings(start_s=0.0, boot_s=0.0))
+    card._reset_radar = radar.reset
+    terminal = Terminal(radar.port)
+
+    def order(text: str) -> bytes:
+        command.sendto(bytes.fromhex(text), card.address)
+        return command.recv(64)
+
+    try:
+        card.start()
+        radar.start()
+        terminal.until()
+        for text in ("5aa506000000aaee", "5aa502000000aaee", "5aa509000000aaee", "5aa50b000600be0571020000aaee"):
+            assert order(text)[4:6] == b"\0\0"
+        assert b"*****" in terminal.until()
+        assert order("5aa50300060001020102031eaaee") == bytes.fromhex("5aa503000000aaee")
+        assert order("5aa505000000aaee") == bytes.fromhex("5aa505000000aaee")
+        configure(terminal, frames=3)
+        assert terminal.ask("sensorStart")[-1] == "Done"
+        received = b""
+        while len(received) < 3 * LAYOUT.nbytes:
+            packet = data.recv(4096)
+            assert int.from_bytes(packet[4:10], "little") == len(received)
+            received += packet[10:]
+        assert received == b"".join(supply("vertical", k).adc.tobytes() for k in range(3))
+        assert LAYOUT.nbytes == 96 * 1456, "182 samples: frames of whole packets"
+        assert terminal.ask("sensorStop") == ["Done"]
+        assert order("5aa506000000aaee") == bytes.fromhex("5aa506000000aaee")
+        assert card.violations == []
+        assert radar.firmware.violations == []
+    finally:
+        terminal.close()
+        for one in (command, data):
+            one.close()
+        assert radar.stop()
+        assert card.stop()
+
+
+def test_unknown_device() -> None:
+    with pytest.raises(CaptureError, match="no demo for this device"):
+        DemoRadar("vertical", supply, lambda data, period_s: None, DemoSettings(device="AWR2944"))
