@@ -16,11 +16,11 @@ from train.simulate.recipe import Recipe
 from train.simulate.shards import Cloud
 from train.simulate.work import Item, Plan
 
-SIZE = {"objects": 10, "drive_bys": 2, "perturbed": 1, "val_share": 0.2, "test_share": 0.2}
+SIZE = {"objects": 6, "drive_bys": 2, "perturbed": 1, "val_share": 0.2, "test_share": 0.2}
 
 
 def small_plan(seed: int = 0, **sizes: int) -> Plan:
-    """Ten parametric objects with three clouds each: three shards. The library is not used."""
+    """Six parametric objects with three clouds each: three shards of six. The library is not used."""
     recipe = Recipe().resized(**SIZE | sizes)  # type: ignore[arg-type]
     count = recipe.set.objects
     names = ("car", "bicycle", "motorcycle", "pedestrian")
@@ -47,7 +47,7 @@ def slow_cloud(item: Item) -> Cloud:
     """As fake_cloud, slow enough to be killed half way."""
     import time
 
-    time.sleep(0.05)
+    time.sleep(0.15)
     return fake_cloud(item)
 
 
@@ -56,7 +56,7 @@ def dying_cloud(item: Item) -> Cloud:
     if item.kind == "simulated" and item.variation == 0:
         if item.object == "car/parametric_00004":
             os.kill(os.getpid(), signal.SIGKILL)
-        if item.object == "car/parametric_00008":
+        if item.object == "car/parametric_00000":
             raise ValueError("no such thing")
     return fake_cloud(item)
 

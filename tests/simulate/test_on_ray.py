@@ -16,7 +16,7 @@ from edge.errors import DependencyError, RfconstructError
 from train.simulate.build import INDEX, build
 from train.simulate.check import check
 from train.simulate.on_ray import RayPool
-from train.simulate.pool import LocalPool
+from train.simulate.pool import Failure, LocalPool
 from train.simulate.shards import Cloud, read_clouds
 from train.simulate.work import Item
 
@@ -49,7 +49,7 @@ def test_the_bytes_are_those_of_local_processes(two_workers: RayPool, tmp_path: 
 def test_a_killed_worker_costs_nothing_and_a_hopeless_item_is_recorded(two_workers: RayPool, tmp_path: Path) -> None:
     plan = small_plan()
     items = [item for number in range(plan.shards) for item in plan.items(number)]
-    once, always, wrong = items[1], items[14], items[20]
+    once, always, wrong = items[1], items[9], items[13]
 
     def make(item: Item) -> Cloud:
         mark = tmp_path / f"tried {item.seed}"
@@ -62,7 +62,7 @@ def test_a_killed_worker_costs_nothing_and_a_hopeless_item_is_recorded(two_worke
         return fake_cloud(item)
 
     built = build(plan, tmp_path / "ray", two_workers, make)
-    assert (built.clouds, built.failed) == (30, 2)
+    assert (built.clouds, built.failed) == (18, 2)
     clouds = {cloud.seed: cloud for shard in read_clouds(tmp_path / "ray") for cloud in shard.clouds}
     assert (tmp_path / f"tried {once.seed}").exists()
     assert len(clouds[once.seed]) == 300
@@ -70,6 +70,20 @@ def test_a_killed_worker_costs_nothing_and_a_hopeless_item_is_recorded(two_worke
     assert clouds[wrong.seed].error == "ValueError: no such thing"
     assert not check(tmp_path / "ray").faults
     assert (tmp_path / "ray" / INDEX).exists()
+
+
+def test_an_item_that_hangs_is_stopped(two_workers: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(two_workers, "_limit_s", 1.0)
+
+    def nap(seconds: int) -> int:
+        import time
+
+        time.sleep(seconds)
+        return seconds
+
+    answers = dict(two_workers.run(nap, [0, 3600]))
+    assert answers[0] == 0
+    assert answers[3600] == Failure("its process died (WorkerCrashedError)")
 
 
 def test_no_cluster_is_an_error_that_says_so(two_workers: RayPool) -> None:

@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_list_and_another_one_does_not(plan: Plan) 
 def test_the_shards_hold_every_item_once() -> None:
     plan = Plan.make(Recipe().resized(objects=9, drive_bys=2, perturbed=1), 0)
     items = [item for number in range(plan.shards) for item in plan.items(number)]
-    assert plan.shards == 3
+    assert plan.shards == 5
     assert len(items) == len(set(items)) == 27
     assert Counter((item.object, item.kind) for item in items) == Counter(
         {(name, kind): count for name in plan.objects for kind, count in (("simulated", 2), ("perturbed", 1))}

@@ -35,7 +35,7 @@ class Here:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("simulated") / "set"
-    build(small_plan(), target, Here(), fake_cloud)
+    build(small_plan(objects=12, drive_bys=4), target, Here(), fake_cloud)
     return target
 
 

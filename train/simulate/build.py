@@ -21,6 +21,7 @@ from edge.errors import ConfigError, RecordingError
 from edge.rig_toml import Place, fill
 from train.objects.reference import ObjectRef
 from train.perturb import perturb
+from train.simulate.cloud_statistics import measure
 from train.simulate.pool import Failure, Pool
 from train.simulate.progress import Progress
 from train.simulate.recipe import Recipe
@@ -41,6 +42,8 @@ from train.simulate.work import Item, Plan, group_key
 SCHEMA = 1
 INDEX, CREDITS = "index.json", "CREDITS.txt"
 _ATTEMPTS = 16
+_FIGURES = ("within_10cm", "within_20cm", "median_m", "coverage", "spacing_m")
+"""Statistics that mean something where there are no radar frames."""
 Maker = Callable[[Item], Cloud]
 
 
@@ -93,9 +96,12 @@ def _perturbed(recipe: Recipe, ref: ObjectRef, item: Item) -> Cloud:
         if len(xyz_m) >= recipe.set.min_points:
             break
     n = len(xyz_m)
+    frame_number = np.zeros(n, np.int64)
+    figures = asdict(measure(mesh, xyz_m, frame_number, 1, [sensor_m], rng))
+    statistics = {name: figures[name] for name in _FIGURES if math.isfinite(figures[name])}
     return Cloud(
-        *(item.object, item.kind, item.variation, item.seed, xyz_m, np.zeros(n, np.float32), np.zeros(n, np.int64)),
-        *(sensor_m, np.eye(3), np.zeros(3), 0, 0.0),
+        *(item.object, item.kind, item.variation, item.seed, xyz_m, np.zeros(n, np.float32), frame_number),
+        *(sensor_m, np.eye(3), np.zeros(3), 0, 0.0, statistics),
     )
 
 
@@ -179,18 +185,18 @@ def _claim(plan: Plan, folder: Path) -> None:
     """Make the folder this plan's, or find that it is already."""
     if (folder / INDEX).exists():
         there = read_plan(folder)
-        for name, now, before in (
-            ("recipe", plan.recipe.sha256, there.recipe.sha256),
-            ("seed", plan.seed, there.seed),
-            ("list of objects (another library?)", plan.objects, there.objects),
-        ):
-            if now != before:
-                raise ConfigError(
-                    f"{folder}: holds a data set of another {name}",
-                    value=f"{len(now)} objects" if isinstance(now, tuple) else now,
-                    allowed=f"those of {INDEX}" if isinstance(before, tuple) else str(before),
-                    action="name another folder, or give the recipe and the seed it was begun with",
-                )
+        differ = plan.recipe.differences(there.recipe)
+        if plan.seed != there.seed:
+            differ.append(f"seed = {plan.seed} ({there.seed})")
+        if not differ and plan.objects != there.objects:
+            differ = [f"{name} (another library?)" for name in sorted({*plan.objects} ^ {*there.objects})]
+        if differ:
+            raise ConfigError(
+                f"{folder}: holds another data set",
+                value=", ".join(differ[:4]),
+                allowed=f"what {INDEX} says (in brackets)",
+                action="name another folder, or give the recipe and the seed that it was begun with",
+            )
         return
     if others := [path.name for path in folder.iterdir() if not path.name.startswith(".")]:
         raise ConfigError(f"{folder}: holds other things", value=sorted(others)[:5], action="name an empty folder")

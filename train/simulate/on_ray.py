@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Any, TypeVar
 
+from edge.config import require
 from edge.errors import DependencyError, RfconstructError
-from train.simulate.pool import TRIES, Failure, guarded
+from train.simulate.pool import LIMIT_S, TRIES, Failure, guarded
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -27,17 +29,20 @@ class RayPool:
     Args:
         address: of the cluster as Ray takes it: "auto", "host:6379", "ray://host:10001"; "local" starts Ray here.
         cores: with "local", how many cores it may use; None = all.
+        limit_s: an item that takes longer is stopped with its process.
     Raises:
         DependencyError: Ray is not installed.
         RfconstructError: no cluster answers there.
     """
 
-    def __init__(self, address: str, cores: int | None = None) -> None:
+    def __init__(self, address: str, cores: int | None = None, limit_s: float = LIMIT_S) -> None:
+        require(limit_s >= 1, "simulate.limit_s", limit_s, ">= 1 s")
         try:
             import ray
         except ImportError as error:
             raise DependencyError("--address needs Ray", action="pip install 'rfconstruct[cluster]'") from error
         self._ray: Any = ray
+        self._limit_s = limit_s
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to anybody
         local = {"num_cpus": cores, "include_dashboard": False} if address == "local" else {}
         try:
@@ -61,7 +66,7 @@ class RayPool:
                     wanted = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
                     looked_s = time.monotonic()
                 for item in islice(source, max(0, wanted - len(pending))):
-                    pending[task(shared, item)] = (item, 1)
+                    pending[task(shared, item, self._limit_s)] = (item, 1)
                 if not pending:
                     return
                 done, _ = ray.wait(list(pending), num_returns=1, timeout=_GROWTH_S)
@@ -69,7 +74,7 @@ class RayPool:
                     item, tries = pending.pop(reference)
                     answer = self._answer(reference)
                     if isinstance(answer, Failure) and tries < TRIES and not answer.error.startswith(_DIED):
-                        pending[task(shared, item)] = (item, tries + 1)
+                        pending[task(shared, item, self._limit_s)] = (item, tries + 1)
                     else:
                         yield item, answer
         finally:
@@ -87,5 +92,11 @@ class RayPool:
         self._ray.shutdown()
 
 
-def _run(function: Callable[[T], R], item: T) -> R | Failure:
-    return guarded(function, item)
+def _run(function: Callable[[T], R], item: T, limit_s: float) -> R | Failure:
+    """Answer an item, or die of the alarm, which also ends a kernel that hangs."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        return guarded(function, item)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)

@@ -19,6 +19,7 @@ from edge.config import require
 T = TypeVar("T")
 R = TypeVar("R")
 TRIES = 2
+LIMIT_S = 900.0
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES}
 
@@ -50,7 +51,7 @@ class LocalPool:
         ConfigError: a number outside its range.
     """
 
-    def __init__(self, workers: int = 0, limit_s: float = 900.0) -> None:
+    def __init__(self, workers: int = 0, limit_s: float = LIMIT_S) -> None:
         require(workers >= 0, "simulate.workers", workers, ">= 0")
         require(limit_s > 0, "simulate.limit_s", limit_s, "> 0 s")
         self.workers = workers or len(os.sched_getaffinity(0))
@@ -144,7 +145,7 @@ class _Worker(Generic[T, R]):
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, self._function), daemon=True)
-        with _one_thread():
+        with _for_workers():
             self._process.start()
         other.close()  # so that the death of the process closes the pipe
 
@@ -160,13 +161,15 @@ class _Worker(Generic[T, R]):
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Environment of a process that must not start threads of its own."""
+def _for_workers() -> Iterator[None]:
+    """What a process started now inherits: one thread for every library, and Ctrl-C blocked."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -176,8 +179,6 @@ def _one_thread() -> Iterator[None]:
 
 def _serve(pipe: Connection, function: Callable[[T], R]) -> None:
     """Answer items until the other end is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with suppress(EOFError, OSError):
         while True:
             pipe.send(guarded(function, pipe.recv()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,12 @@ class Recipe:
         """Of all values, those left at their default included; the text of the file does not count."""
         return digest({name: value for name, value in asdict(self).items() if name != "text"})
 
+    def differences(self, other: Recipe) -> list[str]:
+        """``key = value here (value there)`` for every value that differs."""
+        here, there = (dict(_flat("", asdict(one))) for one in (self, other))
+        keys = [key for key in sorted(here | there) if key != "text" and here.get(key) != there.get(key)]
+        return [f"{key} = {here.get(key)} ({there.get(key)})" for key in keys]
+
     def resized(self, **sizes: int | None) -> Recipe:
         """Another size: fields of ``SetSettings``; None leaves a value as it is."""
         given = {name: value for name, value in sizes.items() if value is not None}
@@ -158,6 +165,14 @@ class Recipe:
 def digest(value: object) -> str:
     """SHA-256, as hex, of a value's canonical JSON, in which 1 and 1.0 are the same."""
     return hashlib.sha256(json.dumps(_plain(value), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _flat(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _flat(f"{key}.{name}" if key else name, inner)
+    else:
+        yield key, value
 
 
 def _plain(value: Any) -> Any:

@@ -16,8 +16,8 @@ from train.objects.reference import HUMAN_FILE, ObjectRef, library_refs
 from train.simulate.recipe import Recipe, digest
 from train.simulate.shards import KINDS, Kind
 
-OBJECTS_PER_SHARD = 4
-"""A shard is what a kill can cost; its file is some 50..100 kB."""
+OBJECTS_PER_SHARD = 2
+"""A shard is what a kill can cost: about half a minute of all cores, 16 drive-bys; its file has some 60 kB."""
 _DEFORM_SEEDS = 1_000_000
 _NUMBERS = 100_000
 _PARAMETRIC_PEOPLE = 5
