@@ -9,9 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import CfarSettings, require
+from edge.dsp.buffers import plane, zeros
 from edge.dsp.doppler import finish
 from edge.dsp.interpolation import PARABOLA
-from edge.dsp.kernels_cfar import SPARE_ROWS, mean_decisions, mean_peaks, ring_halves_kernel, ring_mean_kernel
+from edge.dsp.kernels_cfar import (
+    LINES,
+    SPARE_ROWS,
+    line_cells,
+    mean_decisions,
+    mean_peaks,
+    ring_halves_kernel,
+    ring_mean_kernel,
+    whole,
+)
 from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
 from edge.dsp.kernels_rank import SELECTED, rank_decisions_kernel, rank_noise_kernel, rank_peaks_kernel
 from edge.dsp.maximum import Maximum
@@ -20,10 +30,6 @@ from edge.frames import Detections, Float32, Float64, Heatmap, PointResponse
 
 if TYPE_CHECKING:
     from edge.rig import Radar
-
-
-LINE_BYTES = 64
-"""Of the cache."""
 
 
 class Detector:
@@ -62,10 +68,6 @@ class Detector:
         self._columns = np.zeros((4, settings.max_detections), dtype=np.float32)
         if settings.kind == "os":
             self._rank_peaks, self._rank_noise = rank_peaks_kernel(*self._ring), rank_noise_kernel(*self._ring)
-        elif settings.kind == "ca":
-            self._ring_noise = ring_mean_kernel(*self._ring)
-        else:
-            self._ring_noise = ring_halves_kernel(settings.kind == "go", *self._ring)
 
     def process(self, heatmap: Heatmap) -> Detections:
         """Detections of one heatmap; the columns are the caller's to keep.
@@ -136,13 +138,10 @@ class Detector:
         self._first = int(np.searchsorted(range_m, self.settings.min_range_m))
         self._tables, self._maps = RingTables.of(self.settings, ranges, self._first), None
         self._factors.clear()
-        width = ranges + 2 * self.settings.train_range + self.settings.guard_range
-        self._line = _plane(4, width)
-        self._full, self._side = (_plane(angles + 2 * train + SPARE_ROWS, width) for _ in range(2))
-        self._noise = _plane(angles + SPARE_ROWS, ranges)
+        self._reserve_means(angles, ranges)
         self._cells = np.zeros(angles * (ranges + 1) // 4 + 1, dtype=np.int64)
         self._estimates = np.zeros(len(self._cells), dtype=np.float32)
-        self._padded = _plane(angles + 2 * train, ranges + 2 * self.settings.train_range)
+        self._padded = plane(angles + 2 * train, ranges + 2 * self.settings.train_range)
         self._padded[:] = -1.0
         self._mark, self._row = np.zeros(ranges, dtype=np.float32), np.zeros(ranges, dtype=np.int64)
         box = (2 * train + 1) * (2 * self.settings.train_range + 1)
@@ -152,6 +151,21 @@ class Detector:
         self._range_fit, self._angle_fit, self._response = PARABOLA, PARABOLA, None
         self._axes[4:], self._bounds = 0.0, None
         self._shape, self._ends_m = (angles, ranges), ends_m
+
+    def _reserve_means(self, angles: int, ranges: int) -> None:
+        """Kernel and buffers of the means' detectors."""
+        settings = self.settings
+        if settings.kind == "os":
+            return
+        if settings.kind == "ca":
+            self._ring_noise = ring_mean_kernel(*self._ring, ranges)
+        else:
+            self._ring_noise = ring_halves_kernel(settings.kind == "go", *self._ring, ranges)
+        self._received_plane = zeros((angles + 2 * settings.train_angle + SPARE_ROWS) * whole(ranges))
+        self._line = zeros(LINES * line_cells(ranges, settings.train_range))
+        self._noise = plane(angles + SPARE_ROWS, ranges)
+        self._marks = zeros(whole(ranges), np.uint8)
+        self._words = self._marks.view(np.int64)
 
     def _look_up(self, heatmap: Heatmap) -> None:
         """What points and noise look like, taken over only when it is something else than in the last heatmap."""
@@ -214,7 +228,7 @@ class Detector:
         tables = self._tables
         self._ring_noise(
             *(power, self._pattern, tables.first, tables.inverse_count, tables.floor),
-            *(self._line, self._full, self._side, self._noise),
+            *(self._received_plane, self._line, self._noise),
         )
 
     def _find(self, power: Float32) -> int:
@@ -228,7 +242,8 @@ class Detector:
         else:
             self._estimate(power)
             found = mean_peaks(
-                *(power, self._pattern, self._noise, self._factor, tables.first, self._cells, self._estimates)
+                *(power, self._pattern, self._noise, self._factor, tables.first, self._marks, self._words),
+                *(self._cells, self._estimates),
             )
         return int(found)
 
@@ -245,12 +260,3 @@ class Detector:
             *(heatmap.power, self._pattern, self._cells, self._index, self._estimates, count),
             *(self._range_fit, self._angle_fit, self._axes, self._columns),
         )
-
-
-def _plane(rows: int, width: int) -> Float32:
-    """Zeros [rows, at least width]; every row begins on a cache line, so that vectors do not straddle two."""
-    count = LINE_BYTES // 4
-    pitch = -(-width // count) * count
-    flat = np.zeros(rows * pitch + count, dtype=np.float32)
-    begin = -(flat.ctypes.data // 4) % count
-    return flat[begin : begin + rows * pitch].reshape(rows, pitch)

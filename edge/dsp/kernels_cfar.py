@@ -15,119 +15,156 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from numba import boolean, float32, int64, njit, types, uint64
+from numba import boolean, float32, int64, njit, types, uint8, uint64
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 
 MATRIX = float32[:, ::1]
-MEAN_ARGUMENTS = (MATRIX, float32[::1], int64, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
+MEAN_ARGUMENTS = (MATRIX, float32[::1], int64, MATRIX, MATRIX, float32[::1], float32[::1], MATRIX)
 ROWS = 4
 """Angle rows whose sums are made together."""
 SPARE_ROWS = ROWS - 1
 """Rows that planes have beyond the angles, so that the last group of rows is a whole one."""
-BLOCK = 32
-"""Range cells of which one must exceed the threshold before any of them is looked at."""
+LINES = 2 * ROWS + 2
+"""Lines of work space: two for each of the rows, and two more."""
+VECTOR = 16
+"""float32 values of the widest vector: rows and lines are whole numbers of them, so that loops have no remainder."""
+WORD = 8
+"""Range cells whose marks are looked at together."""
+
+
+def whole(cells: int) -> int:
+    """``cells`` rounded up to whole vectors: cells of a row of the plane."""
+    return -(-cells // VECTOR) * VECTOR
+
+
+def line_cells(ranges: int, train_range: int) -> int:
+    """Cells of a line of work space, which begins with ``whole(train_range)`` zeros."""
+    return whole(train_range) + whole(ranges + 2 * train_range) + 3 * VECTOR
 
 
 @njit(inline="always")
-def _load(power, pattern, a, first, train, line):  # type: ignore[no-untyped-def]
-    """One angle row as received into ``line[0]``, which has ``train`` zeros at both ends; zeros below ``first``."""
-    ranges, level = power.shape[1], pattern[a]
-    for r in range(ranges):
-        line[0, train + r] = power[a, r] * level
-    for r in range(first):
-        line[0, train + r] = float32(0)
+def _receive(power, pattern, first, train_angle, ranges, pitch, plane):  # type: ignore[no-untyped-def]
+    """Power as received, rows of ``pitch`` cells, zeros below ``first``, ``train_angle`` rows repeated at both ends."""
+    angles, begin = power.shape[0], uint64(train_angle * pitch)
+    for a in range(angles):
+        level, row = pattern[a], begin + uint64(a * pitch)
+        for r in range(ranges):
+            plane[row + uint64(r)] = power[a, r] * level
+        for r in range(first):
+            plane[row + uint64(r)] = float32(0)
+    behind = begin + uint64(angles * pitch)
+    for x in range(train_angle * pitch):
+        plane[uint64(x)] = plane[uint64(x) + uint64(angles * pitch)]
+        plane[behind + uint64(x)] = plane[begin + uint64(x)]
 
 
 @njit(inline="always")
-def _close(planes, angles, train_angle):  # type: ignore[no-untyped-def]
-    """Repeat ``train_angle`` rows of the periodic axis at either end of a plane [angles + 2 train_angle, ...]."""
-    for t in range(train_angle):
-        planes[t] = planes[angles + t]
-        planes[angles + train_angle + t] = planes[train_angle + t]
-
-
-@njit(inline="always")
-def _sum_of_pairs(cells, pairs, x, width):  # type: ignore[no-untyped-def]
-    """Sum of ``width`` cells from ``x`` on; ``pairs[x]`` = cells[x] + cells[x + 1]."""
-    total = float32(0)
-    for d in range(width // 2):
-        total += pairs[x + 2 * d]
-    if width % 2 == 1:
-        total += cells[x + width - 1]
-    return total
-
-
-@njit(inline="always")
-def _sums_of_rows(plane, a, r, width):  # type: ignore[no-untyped-def]
-    """Sums over ``width`` rows of one column, from row a, a + 1, a + 2 and a + 3 on; what they share is added once."""
+def _sums_of_rows(plane, x, pitch, width):  # type: ignore[no-untyped-def]
+    """Sums over ``width`` rows of a column, from cell x and from 1, 2 and 3 rows on; what they share is added once."""
     shared = float32(0)
     if width < ROWS:
         one, two, three, four = shared, shared, shared, shared
         for d in range(width):
-            one += plane[a + d, r]
-            two += plane[a + 1 + d, r]
-            three += plane[a + 2 + d, r]
-            four += plane[a + 3 + d, r]
+            one += plane[x + uint64(d * pitch)]
+            two += plane[x + uint64((1 + d) * pitch)]
+            three += plane[x + uint64((2 + d) * pitch)]
+            four += plane[x + uint64((3 + d) * pitch)]
         return one, two, three, four
     for d in range(ROWS - 1, width):
-        shared += plane[a + d, r]
-    before = plane[a + 1, r] + plane[a + 2, r]
-    behind = plane[a + width, r] + plane[a + width + 1, r]
-    one, two = shared + (plane[a, r] + before), shared + (before + plane[a + width, r])
-    three, four = shared + (plane[a + 2, r] + behind), shared + (behind + plane[a + width + 2, r])
-    return one, two, three, four
+        shared += plane[x + uint64(d * pitch)]
+    before = plane[x + uint64(pitch)] + plane[x + uint64(2 * pitch)]
+    after = plane[x + uint64(width * pitch)]
+    behind = after + plane[x + uint64((width + 1) * pitch)]
+    one, two = shared + (plane[x] + before), shared + (before + after)
+    three = shared + (plane[x + uint64(2 * pitch)] + behind)
+    return one, two, three, shared + (behind + plane[x + uint64((width + 2) * pitch)])
+
+
+@njit(inline="always")
+def _sums_of_columns(plane, a, apart, guarded, ranges, pitch, all_rows, line, left, cells):  # type: ignore[no-untyped-def]
+    """Sums over the rows of the rings around angle rows a..a + 3, column by column, into lines of ``cells`` each.
+
+    Lines 0..3 receive the sums over the 2 * ``apart`` rows beyond the guarded ones, lines 4..7 those over the
+    ``guarded`` rows, or over ``all_rows``, each from place ``left`` on.
+    """
+    above = uint64(a * pitch)
+    beside, below = above + uint64(apart * pitch), above + uint64((apart + guarded) * pitch)
+    share = float32(1) if all_rows else float32(0)
+    for r in range(ranges):
+        x, y = uint64(r), uint64(left + r)
+        near, far = _sums_of_rows(plane, above + x, pitch, apart), _sums_of_rows(plane, below + x, pitch, apart)
+        middle = _sums_of_rows(plane, beside + x, pitch, guarded)
+        one, two, three, four = near[0] + far[0], near[1] + far[1], near[2] + far[2], near[3] + far[3]
+        line[y], line[y + uint64(cells)] = one, two
+        line[y + uint64(2 * cells)], line[y + uint64(3 * cells)] = three, four
+        line[y + uint64(4 * cells)], line[y + uint64(5 * cells)] = middle[0] + share * one, middle[1] + share * two
+        line[y + uint64(6 * cells)] = middle[2] + share * three
+        line[y + uint64(7 * cells)] = middle[3] + share * four
+
+
+@njit(inline="always")
+def _sums_along(line, start, width, count, into):  # type: ignore[no-untyped-def]
+    """line[into + x] = sum of ``width`` cells from ``start + x`` on, x < ``count``."""
+    for n in range(count):
+        x = uint64(start) + uint64(n)
+        total = float32(0)
+        for d in range(width):
+            total += line[x + uint64(d)]
+        line[uint64(into) + uint64(n)] = total
 
 
 @cache
-def ring_mean_kernel(guard_angle: int, train_angle: int, guard_range: int, train_range: int) -> Callable[..., Any]:
+def ring_mean_kernel(
+    guard_angle: int, train_angle: int, guard_range: int, train_range: int, ranges: int
+) -> Callable[..., Any]:
     """Compile the cell-averaging noise estimate for one ring.
 
     Args:
         guard_angle, train_angle, guard_range, train_range: half widths in cells.
+        ranges: R, range cells of the map.
     Returns:
-        kernel(power [A, R], pattern [A], first, inverse_count [2, R], floor [2, R], line [4, R + 2 train_range or more]
-        zeroed, full, side [A + 2 train_angle + 3, as line], noise [A + 3, R or more]): ``noise`` = mean of the ring's
-        cells; its last 3 rows are work space.
+        kernel(power [A, R], pattern [A], first, inverse_count [2, R], floor [2, R], plane [(A + 2 train_angle + 3) *
+        whole(R)], line [LINES * line_cells(R, train_range)] zeroed, noise [A + 3, R or more]): ``noise`` = mean of the
+        ring's cells; its last 3 rows are work space.
     """
-    outside, behind = train_range - guard_range, train_range + guard_range + 1
+    pitch, left, cells = whole(ranges), whole(train_range), line_cells(ranges, train_range)
     apart, guarded = train_angle - guard_angle, 2 * guard_angle + 1
+    outside, inside, behind = train_range - guard_range, 2 * guard_range + 1, train_range + guard_range + 1
+    half, count = outside // 2, whole(ranges + 2 * train_range)
+    pairs, outer = 2 * ROWS * cells, (2 * ROWS + 1) * cells
 
     @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
-    def kernel(power, pattern, first, inverse_count, floor, line, full, side, noise):  # type: ignore[no-untyped-def]
-        angles, ranges = power.shape
-        for a in range(angles):
-            _load(power, pattern, a, first, train_range, line)
-            row = a + train_angle
-            for x in range(ranges + 2 * train_range - 1):
-                line[1, x] = line[0, x] + line[0, x + 1]
-            for x in range(ranges + behind):
-                line[2, x] = _sum_of_pairs(line[0], line[1], x, outside)
-            for r in range(ranges):
-                outer = line[2, r] + line[2, r + behind]
-                side[row, r] = outer
-                full[row, r] = outer + _sum_of_pairs(line[0], line[1], r + outside, 2 * guard_range + 1)
-        _close(full, angles, train_angle)
-        _close(side, angles, train_angle)
-        for a in range(0, angles, ROWS):
-            one, two, three, four = noise[a], noise[a + 1], noise[a + 2], noise[a + 3]
-            for r in range(ranges):
-                near = _sums_of_rows(full, a, r, apart)
-                far = _sums_of_rows(full, a + apart + guarded, r, apart)
-                one[r], two[r] = near[0] + far[0], near[1] + far[1]
-                three[r], four[r] = near[2] + far[2], near[3] + far[3]
-            for r in range(ranges):
-                beside, share = _sums_of_rows(side, a + apart, r, guarded), inverse_count[0, r]
-                one[r], two[r] = (one[r] + beside[0]) * share, (two[r] + beside[1]) * share
-                three[r], four[r] = (three[r] + beside[2]) * share, (four[r] + beside[3]) * share
+    def kernel(power, pattern, first, inverse_count, floor, plane, line, noise):  # type: ignore[no-untyped-def]
+        _receive(power, pattern, first, train_angle, ranges, pitch, plane)
+        for a in range(0, power.shape[0], ROWS):
+            _sums_of_columns(plane, a, apart, guarded, ranges, pitch, True, line, left, cells)
+            for k in range(ROWS):
+                beyond = k * cells + left - train_range
+                every = beyond + ROWS * cells
+                _sums_along(line, every, 2, count, pairs)
+                for r in range(count - train_range):
+                    x = uint64(r)
+                    total = float32(0)
+                    for d in range(half):
+                        total += line[x + uint64(pairs + 2 * d)]
+                    if outside % 2 == 1:
+                        total += line[x + uint64(every) + uint64(outside - 1)]
+                    line[x + uint64(outer)] = total
+                for r in range(ranges):
+                    x = uint64(r)
+                    total = line[x + uint64(outer)] + line[x + uint64(outer + behind)]
+                    for d in range(inside):
+                        total += line[x + uint64(beyond) + uint64(outside + d)]
+                    noise[a + k, r] = total * inverse_count[0, r]
 
     return kernel
 
 
 @cache
 def ring_halves_kernel(
-    greatest: bool, guard_angle: int, train_angle: int, guard_range: int, train_range: int
+    greatest: bool, guard_angle: int, train_angle: int, guard_range: int, train_range: int, ranges: int
 ) -> Callable[..., Any]:
     """Compile the greatest-of or smallest-of noise estimate for one ring.
 
@@ -135,45 +172,31 @@ def ring_halves_kernel(
 
     Args:
         greatest: the larger of both halves' means; else the smaller.
-        guard_angle, train_angle, guard_range, train_range: half widths in cells.
+        guard_angle, train_angle, guard_range, train_range, ranges: as in ``ring_mean_kernel``.
     Returns:
         kernel as ``ring_mean_kernel``'s; the mean of half h is its sum times ``inverse_count[h]`` plus ``floor[h]``.
     """
-    beside, behind = train_range - guard_range, train_range + guard_range + 1
+    pitch, left, cells = whole(ranges), whole(train_range), line_cells(ranges, train_range)
+    apart, guarded = train_angle - guard_angle, 2 * guard_angle + 1
+    outside, behind, count = train_range - guard_range, train_range + guard_range + 1, whole(ranges + train_range)
+    outer, inner = 2 * ROWS * cells, (2 * ROWS + 1) * cells
 
     @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
-    def kernel(power, pattern, first, inverse_count, floor, line, full, side, noise):  # type: ignore[no-untyped-def]
-        angles, ranges = power.shape
-        for a in range(angles):
-            _load(power, pattern, a, first, train_range, line)
-            row = a + train_angle
-            for x in range(ranges + behind):
-                outer = float32(0)
-                for d in range(beside):
-                    outer += line[0, x + d]
-                inner = float32(0)
-                for d in range(guard_range):
-                    inner += line[0, x + beside + d]
-                side[row, x], full[row, x] = outer, outer + inner
-        _close(full, angles, train_angle)
-        _close(side, angles, train_angle)
-        for a in range(angles):
-            for x in range(ranges + behind):
-                outer = float32(0)
-                for d in range(train_angle - guard_angle):
-                    outer += full[a + d, x] + full[a + train_angle + guard_angle + 1 + d, x]
-                line[1, x] = outer
-            for x in range(ranges + behind):
-                inner = float32(0)
-                for d in range(2 * guard_angle + 1):
-                    inner += side[a + train_angle - guard_angle + d, x]
-                line[2, x] = inner
-            for r in range(ranges):
-                near = line[1, r] + line[2, r]
-                far = line[1, r + train_range + 1] + line[2, r + behind]
-                near = near * inverse_count[0, r] + floor[0, r]
-                far = far * inverse_count[1, r] + floor[1, r]
-                noise[a, r] = max(near, far) if greatest else min(near, far)
+    def kernel(power, pattern, first, inverse_count, floor, plane, line, noise):  # type: ignore[no-untyped-def]
+        _receive(power, pattern, first, train_angle, ranges, pitch, plane)
+        for a in range(0, power.shape[0], ROWS):
+            _sums_of_columns(plane, a, apart, guarded, ranges, pitch, False, line, left, cells)
+            for k in range(ROWS):
+                beyond = k * cells + left - train_range
+                _sums_along(line, beyond, train_range, count + VECTOR, outer)
+                _sums_along(line, beyond + ROWS * cells, outside, count + VECTOR, inner)
+                for r in range(ranges):
+                    x = uint64(r)
+                    near = line[x + uint64(outer)] + line[x + uint64(inner)]
+                    far = line[x + uint64(outer + train_range + 1)] + line[x + uint64(inner + behind)]
+                    near = near * inverse_count[0, r] + floor[0, r]
+                    far = far * inverse_count[1, r] + floor[1, r]
+                    noise[a + k, r] = max(near, far) if greatest else min(near, far)
 
     return kernel
 
@@ -187,23 +210,46 @@ def mean_decisions(power, pattern, noise, factor, first, decided):  # type: igno
 
 
 @njit(inline="always")
+def _largest(power, a, r):  # type: ignore[no-untyped-def]
+    """Largest of a cell and those beside it in range."""
+    last = power.shape[1] - 1
+    return max(max(power[a, max(r - 1, 0)], power[a, min(r + 1, last)]), power[a, r])
+
+
+@njit(inline="always")
 def is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
     """Largest received power of its 3 x 3 neighbourhood; of equal neighbours the first in raster order is the peak."""
     angles, ranges = power.shape
-    centre = power[a, r] * pattern[a]
-    for da in range(-1, 2):
-        row = (a + da + angles) % angles
-        for dr in range(-1, 2):
-            c = r + dr
-            if (da != 0 or dr != 0) and 0 <= c < ranges:
-                value = power[row, c] * pattern[row]
-                if value > centre or (value == centre and (row < a or (row == a and c < r))):
-                    return False
-    return True
+    above = a - 1 if a > 0 else angles - 1
+    below = a + 1 if a + 1 < angles else 0
+    centre, level = power[a, r] * pattern[a], pattern[a]
+    up, down = _largest(power, above, r) * pattern[above], _largest(power, below, r) * pattern[below]
+    if up > centre or down > centre or power[a, min(r + 1, ranges - 1)] * level > centre:
+        return False
+    if r > 0 and power[a, r - 1] * level >= centre:
+        return False
+    return not ((up == centre and above < a) or (down == centre and below < a))
 
 
-@njit(int64(float32[:, ::1], float32[::1], float32[:, ::1], float32[::1], int64, int64[::1], float32[::1]), **OPTIONS)
-def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: ignore[no-untyped-def]
+@njit(inline="always")
+def _mark(power, pattern, noise, factor, first, a, mark):  # type: ignore[no-untyped-def]
+    """1 where a tested cell of a row exceeds its threshold and is no less than its neighbours in angle, else 0."""
+    angles, ranges = power.shape
+    above, below = (a + angles - 1) % angles, (a + 1) % angles
+    level, up, down = pattern[a], pattern[above], pattern[below]
+    for r in range(ranges):
+        centre = power[a, r] * level
+        exceeds = uint8(centre > factor[r] * noise[a, r])
+        mark[r] = exceeds & uint8(centre >= power[above, r] * up) & uint8(centre >= power[below, r] * down)
+    for r in range(first):
+        mark[r] = uint8(0)
+
+
+PEAK_ARGUMENTS = (MATRIX, float32[::1], MATRIX, float32[::1], int64, uint8[::1], int64[::1], int64[::1], float32[::1])
+
+
+@njit(int64(*PEAK_ARGUMENTS), **OPTIONS)
+def mean_peaks(power, pattern, noise, factor, first, mark, words, cells, estimate):  # type: ignore[no-untyped-def]
     """Local maxima of the received power that exceed the threshold of a noise map.
 
     Args:
@@ -212,6 +258,8 @@ def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: 
         noise: [A, R] or more, as received.
         factor: [R].
         first: first tested range cell.
+        mark: uint8 [whole(R)], zeros beyond R, work space.
+        words: the same memory as int64 [whole(R) / 8].
         cells: int64 [A R / 4], receives flat indices a R + r.
         estimate: float32 [A R / 4], receives the noise of each.
     Returns:
@@ -220,18 +268,13 @@ def mean_peaks(power, pattern, noise, factor, first, cells, estimate):  # type: 
     angles, ranges = power.shape
     count = 0
     for a in range(angles):
-        level = pattern[a]
-        for start in range(first, ranges, BLOCK):
-            begin, above = uint64(start), float32(1)
-            if start + BLOCK <= ranges:
-                above = float32(0)
-                for d in range(BLOCK):
-                    c = begin + uint64(d)
-                    above += float32(1) if power[a, c] * level > factor[c] * noise[a, c] else float32(0)
-            if above > float32(0):
-                for r in range(start, min(start + BLOCK, ranges)):
-                    if power[a, r] * level > factor[r] * noise[a, r] and is_peak(power, pattern, a, r):
-                        cells[count] = a * ranges + r
-                        estimate[count] = noise[a, r]
-                        count += 1
+        _mark(power, pattern, noise, factor, first, a, mark)
+        for w in range(len(words)):
+            if words[w] == 0:
+                continue
+            for r in range(WORD * w, WORD * w + WORD):
+                if mark[r] != 0 and is_peak(power, pattern, a, r):
+                    cells[count] = a * ranges + r
+                    estimate[count] = noise[a, r]
+                    count += 1
     return count

@@ -35,7 +35,8 @@ def main(count: int) -> None:
         "imager 3 m/s": lambda: imager.process(frame, np.array([0.0, 3.0, 0.0])),
         "ring mean": lambda: ca._estimate(power),
         "peaks": lambda: mean_peaks(
-            *(power, ca._pattern, ca._noise, tables.factor, tables.first, ca._cells, ca._estimates)
+            *(power, ca._pattern, ca._noise, tables.factor, tables.first, ca._marks, ca._words),
+            *(ca._cells, ca._estimates),
         ),
         "detector CA": lambda: ca.process(heatmap),
         "detector GO": lambda: go.process(heatmap),

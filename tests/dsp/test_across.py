@@ -109,9 +109,7 @@ def noise_only(radar, rng):
     return dataclasses.replace(frame, adc=noise.astype(np.int16))
 
 
-@pytest.mark.parametrize(
-    ("p_fa", "frames"), [(1e-2, 10), pytest.param(1e-3, 100, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("p_fa", "frames"), [(1e-2, 10), pytest.param(1e-3, 100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("loops", "speed_m_s"), [(1, 0.5), (1, 3.0), (1, 5.0), (2, 3.0), (3, 1.0), (3, 3.0), (3, 5.0), (8, 1.0)]
 )
