@@ -19,6 +19,8 @@ DIRECT, MIXED, GROUND = 0, 1, 2
 """Path classes: both legs direct; one of them by way of the ground (two channels of equal weight); both."""
 SEEN, SEEN_IN_GROUND = 1, 2
 """Bits of the visibility of a point: from the radar, from its image below the ground."""
+LEAST_AREA_M2 = 1e-12
+"""Triangles of less are a line."""
 SERIES_BELOW = 0.02
 """q^2 A below which the triangle's integral is its series to second order (error below 1e-5)."""
 CURVED_FROM = 0.02
@@ -35,23 +37,27 @@ def triangle_integral(qx: float, qy: float, qz: float, shape: Float32) -> comple
 
     Args:
         qx, qy, qz: wave vector, rad/m; only its part in the triangle's plane matters.
-        shape: [4, 3], centre (not used), unit normal and the two sides from the first corner, metres.
+        shape: [4, 3], centre and normal (not used) and the two sides from the first corner, metres.
     Source: Gordon, "Far-field approximations to the Kirchhoff-Helmholtz representations of scattered fields", IEEE
         Trans. Antennas Propag. 23(4), 1975: the theorem of Green turns the area into a sum over the three sides.
     """
-    nx, ny, nz = np.float64(shape[1, 0]), np.float64(shape[1, 1]), np.float64(shape[1, 2])
     ux, uy, uz = np.float64(shape[2, 0]), np.float64(shape[2, 1]), np.float64(shape[2, 2])
     vx, vy, vz = np.float64(shape[3, 0]), np.float64(shape[3, 1]), np.float64(shape[3, 2])
-    normal = qx * nx + qy * ny + qz * nz
-    plane = qx * qx + qy * qy + qz * qz - normal * normal
+    # The normal anew in float64: a rounded one would let q's large normal part leak into the plane.
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    double = math.sqrt(nx * nx + ny * ny + nz * nz)
+    if double < LEAST_AREA_M2:
+        return complex(0.0, 0.0)
+    nx, ny, nz = nx / double, ny / double, nz / double
+    area = 0.5 * double
+    tx, ty, tz = ny * qz - nz * qy, nz * qx - nx * qz, nx * qy - ny * qx
+    plane = tx * tx + ty * ty + tz * tz
     a, b = qx * ux + qy * uy + qz * uz, qx * vx + qy * vy + qz * vz
-    area = 0.5 * (nx * (uy * vz - uz * vy) + ny * (uz * vx - ux * vz) + nz * (ux * vy - uy * vx))
     first = -(a + b) / 3.0
     second, third = first + a, first + b
     if plane * area < SERIES_BELOW:
         return complex(area * (1.0 - (first * first + second * second + third * third) / 24.0), 0.0)
     # Sides i -> j in the sense of the normal: weight q . (l x n), phase at the middle, half the phase along it.
-    tx, ty, tz = ny * qz - nz * qy, nz * qx - nx * qz, nx * qy - ny * qx
     g_first = ux * tx + uy * ty + uz * tz
     g_third = -(vx * tx + vy * ty + vz * tz)
     g_second = -(g_first + g_third)

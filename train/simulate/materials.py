@@ -53,9 +53,11 @@ class Material:
         require(0.0 <= self.imbalance_db <= 20.0, "material.imbalance_db", self.imbalance_db, "0..20")
 
 
-CAR = Material((0.3, 1.0), (0.8, 1.0), (5e-6, 3e-5), (1e-3, 1e-2), (0.2, 0.6), (-25.0, 0.0), (5, 15), 2.0)
+CAR = Material((0.3, 1.0), (0.8, 1.0), (5e-6, 3e-5), (1e-3, 1e-2), (0.2, 0.6), (-20.0, 3.0), (6, 18), 2.0)
 BICYCLE = Material((0.3, 1.0), (0.3, 1.0), (5e-6, 1e-4), (2e-2, 1e-1), (0.2, 0.6), (-30.0, -12.0), (3, 8), 4.0)
 MOTORCYCLE = Material((0.3, 1.0), (0.3, 1.0), (5e-6, 1e-4), (1e-2, 5e-2), (0.2, 0.6), (-25.0, -5.0), (4, 10), 3.0)
 PEDESTRIAN = Material((0.2, 0.5), (0.2, 0.5), (1e-3, 5e-3), (5e-2, 1.5e-1), (0.0, 0.2), (-35.0, -20.0), (2, 5), 2.0)
+WALL = Material((0.25, 0.4), (0.25, 0.4), (3e-4, 1e-3), (1e-2, 5e-2), (0.0, 0.2), (-40.0, -30.0), (0, 0), 1.0)
+"""Concrete or plaster; give it to the class that the wall's mesh bears."""
 
 BY_CLASS: dict[ClassName, Material] = dict(zip(CLASSES, (CAR, BICYCLE, MOTORCYCLE, PEDESTRIAN), strict=True))

@@ -11,13 +11,14 @@ import numpy as np
 from edge.config import require
 from edge.frames import Float32, Float64
 from train.objects.mesh import Mesh
-from train.objects.sampling import Int32, bounds
+from train.objects.sampling import Int32, bounds, face_areas
 from train.simulate import kernels_surface as kernels
 from train.simulate.materials import Material
 from train.simulate.points import Parts, Patches, Points, board_factors, draw_points
 from train.simulate.surface_settings import SurfaceSettings as SurfaceSettings
 
 WELD_M = 1e-4
+LEAST_FACE_M2 = 1e-9
 VISIBILITY_SIDE_M = 0.5
 """Longest side of the triangles that hide others: those that reach behind the camera are left out as a whole."""
 
@@ -120,8 +121,12 @@ def clean(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
     welded = welded[(a != b) & (b != c) & (a != c)]
     a, b, c = np.sort(welded, axis=1).astype(np.int64).T
     _, kept = np.unique((a << 42) | (b << 21) | c, return_index=True)
-    require(len(kept) > 0, "mesh faces", 0, "at least one triangle larger than 0.1 mm")
-    return np.ascontiguousarray(vertices[first]), np.ascontiguousarray(welded[np.sort(kept)])
+    welded, vertices = welded[np.sort(kept)], np.ascontiguousarray(vertices[first])
+    areas = np.empty(len(welded))
+    face_areas(vertices, welded, areas)
+    welded = np.ascontiguousarray(welded[areas > LEAST_FACE_M2])
+    require(len(welded) > 0, "mesh faces", 0, "at least one triangle larger than 0.1 mm")
+    return vertices, welded
 
 
 def _draw_parts(

@@ -18,7 +18,7 @@ class SurfaceSettings:
         patch_share: size of a patch, half a square, in units of sqrt(lambda R); its longest side is sqrt(2) of it.
         patch_least_m, max_patches: patches are never smaller, and coarser where there would be more of them.
         crease_deg: faces that meet at less are one smooth surface; at more the edge reflects on its own.
-        phong: share of Phong tessellation; 0 leaves facets flat.
+        phong: share of Phong tessellation; 0 leaves facets flat, 1/2 gives a sphere of facets its own curvature.
         diffuse_points: how many points stand for the diffuse part of an object.
         edge_m: longest piece of an edge that is one point.
         edge_points: most edge points of an object; longer pieces stand for more.
@@ -32,7 +32,7 @@ class SurfaceSettings:
     patch_least_m: float = 0.01
     max_patches: int = 250_000
     crease_deg: float = 40.0
-    phong: float = 0.75
+    phong: float = 0.5
     diffuse_points: int = 512
     edge_m: float = 0.05
     edge_points: int = 1500

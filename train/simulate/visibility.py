@@ -53,7 +53,6 @@ class SceneVisibility:
         self._surfaces = tuple(surfaces)
         self._camera = [np.empty_like(surface.vertices) for surface in surfaces]
         self._inverse = np.empty((rows, columns), np.float32)
-        self._farthest = np.empty((rows, columns), np.float32)
         self._every_point = [np.arange(len(surface.points), dtype=np.int32) for surface in surfaces]
         self.candidates: list[Int32] = [np.empty(0, np.int32) for _ in surfaces]
         """Patches of every object that were looked at."""
@@ -111,21 +110,25 @@ class SceneVisibility:
             return
         axes = _look(middle)
         window = np.array([np.inf, np.inf, -np.inf, -np.inf])
-        turned, eye = self._project(number, views, eyes, axes, window)
+        turned, eye = self._project(number, views[number].rotation, eyes[number], axes, window)
         if not window[0] < window[2] or not window[1] < window[3]:
             return
         rows, columns = self._inverse.shape
-        focal = float(min((columns - 1) / (window[2] - window[0]), (rows - 1) / (window[3] - window[1])))
+        focal = float(min((columns - 3) / (window[2] - window[0]), (rows - 3) / (window[3] - window[1])))
         column = 0.5 * (columns - 1) - 0.5 * focal * (window[0] + window[2])
         row = 0.5 * (rows - 1) - 0.5 * focal * (window[1] + window[3])
         self._inverse[:] = 0.0
         kernels.rasterize(self._camera[number], surface.faces, focal, column, row, self._inverse)
         for other in range(len(views)):
-            if other != number and self._may_hide(other, number, views, eyes, middle):
-                self._project(other, views, eyes, axes, np.zeros(4))
+            may_hide = other == number or self._may_hide(other, number, views, eyes, middle)
+            if may_hide and other != number:
+                self._project(other, views[other].rotation, eyes[other], axes, np.zeros(4))
                 kernels.rasterize(self._camera[other], self._surfaces[other].faces, focal, column, row, self._inverse)
-        kernels.farthest(self._inverse, self._farthest)
-        picture = (focal, column, row, self._farthest)
+            if may_hide and bit == SEEN_IN_GROUND:
+                # On its way down to the ground the wave meets the objects, in the image's space their images.
+                self._project(other, views[other].rotation, views[other].eye_m, axes * (1.0, 1.0, -1.0), np.zeros(4))
+                kernels.rasterize(self._camera[other], self._surfaces[other].faces, focal, column, row, self._inverse)
+        picture = (focal, column, row, self._inverse)
         for points, index, bias_m, seen in (
             (surface.patches.flat, self.candidates[number], PATCH_BIAS_M, self.patches[number]),
             (surface.points.position, self._every_point[number], POINT_BIAS_M, self.points[number]),
@@ -135,11 +138,10 @@ class SceneVisibility:
         kernels.test_points(clutter_m, every, axes, np.zeros(3), *picture, CLUTTER_BIAS_M, bit, clutter_seen)
 
     def _project(
-        self, number: int, views: Sequence[View], eyes: Sequence[Float64], axes: Float64, window: Float64
+        self, number: int, rotation: Float64, eye_m: Float64, axes: Float64, window: Float64
     ) -> tuple[Float64, Float64]:
         """Camera axes and place in the object's frame; its vertices go to its buffer."""
-        rotation = views[number].rotation
-        turned, eye = np.ascontiguousarray(axes @ rotation), rotation.T @ eyes[number]
+        turned, eye = np.ascontiguousarray(axes @ rotation), rotation.T @ eye_m
         kernels.to_camera(self._surfaces[number].vertices, turned, eye, self._camera[number], window)
         return turned, eye
 
