@@ -127,10 +127,23 @@ def test_splits_share_no_object(object_data: Path) -> None:
 
 def test_library_and_parametric_objects_are_mixed(object_data: Path) -> None:
     data = CompletionDataset("train", replace(SMALL, objects_dir=object_data), 0)
-    origins = {data.mesh(i).provenance for i in range(64)}
+    origins = {data.mesh(i).provenance for i in range(40)}
     assert "own" in origins
     assert origins & {"A", "B", "C"}
     assert "P" in origins
+
+
+def test_riders_are_drawn_for_half_of_the_two_wheelers(object_data: Path) -> None:
+    """Of the library's, in train only; the share is a setting."""
+    only_library = dict.fromkeys(CLASSES, (1.0, 0.0, 0.0))
+    settings = replace(SMALL, objects_dir=object_data, origin_share=only_library)  # type: ignore[arg-type]
+    data = CompletionDataset("train", settings, 0)
+    ridden = ["@" in data.mesh(index).object_id for index in range(64) if index % 4 in (1, 2)]
+    assert 0.25 < np.mean(ridden) < 0.75
+    never = CompletionDataset("train", replace(settings, rider_share=0.0), 0)
+    assert not any("@" in never.mesh(index).object_id for index in range(32))
+    test = CompletionDataset("test", settings, 0)
+    assert not any("@" in test.mesh(index).object_id for index in range(0, len(test), 8))
 
 
 def test_parametric_evaluation_objects_differ_from_training_ones() -> None:

@@ -59,6 +59,31 @@ def test_cars_have_the_measures_that_were_drawn(style: str) -> None:
         assert profile[0, 1] > shape.clearance + 0.2
 
 
+def test_styles_are_what_their_names_say() -> None:
+    """Side view at three quarters of a car behind the roof: a boot is low, a hatch high, a bed lower than its cabin."""
+    assert {"sedan", "hatchback", "suv", "van", "pickup"} <= set(STYLES)
+    for seed in range(20):
+        tail, height = {}, {}
+        for style in STYLES:
+            shape = draw_shape(np.random.default_rng(seed), style)
+            profile = top_profile(shape)
+            tail[style] = float(np.interp(0.95 * shape.length, profile[:, 0], profile[:, 1])) / shape.height
+            height[style] = shape.height
+        assert tail["sedan"] < 0.72
+        assert tail["pickup"] < 0.72
+        assert tail["van"] > 0.85
+        assert height["sedan"] < height["suv"] < height["van"] + 0.3
+        assert min(tail["hatchback"], tail["suv"]) > 0.6
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_seeds_never_give_the_same_object_twice(name: ClassName) -> None:
+    """Sizes of forty of them differ pairwise by more than rounding."""
+    sizes = np.array([generate(name, seed).size_m for seed in range(40)])
+    away = np.abs(sizes[:, None] - sizes[None]).max(axis=2) + 10 * np.eye(40)
+    assert away.min() > 1e-4
+
+
 def test_wheels_touch_the_ground_and_body_does_not() -> None:
     mesh = generate("car", 0)
     low = mesh.vertices[mesh.vertices[:, 2] < 0.1]

@@ -227,25 +227,40 @@ def _wheel(radius: float, width: float, center: tuple[float, float, float]) -> P
 
 
 def _attachments(shape: CarShape, rng: np.random.Generator) -> list[Part]:
-    """Mirrors, and sometimes roof rails, a roof box, a spoiler or a spare wheel."""
+    """Mirrors, and sometimes roof rails, a roof box, a spoiler, a spare wheel, a sign on the roof or a load."""
     half, h = shape.width / 2, shape.height
     mirror = superellipsoid(
         (-(shape.cowl + 0.45), half + 0.06, shape.belt_height + 0.07), (0.06, 0.11, 0.075), (0.6, 0.6), steps=(10, 7)
     )
     parts = [mirror, mirrored(mirror)]
-    roof_middle = -0.52 * shape.length
+    profile = top_profile(shape)
+    roof, middle = float(profile[6, 0] - profile[4, 0]), -float(profile[6, 0] + profile[4, 0]) / 2
     if shape.style in ("estate", "suv", "minivan") and rng.random() < 0.5:
-        rail = box((roof_middle - 0.05, 0.55 * shape.width / 2, h - 0.03), (0.26 * shape.length, 0.035, 0.09))
+        rail = box((middle, 0.5 * half + 0.12, h - 0.02), (0.85 * roof, 0.035, 0.09))
         parts += [rail, mirrored(rail)]
     if shape.style not in ("pickup", "van") and rng.random() < 0.06:
-        half_box = (0.75, 0.32, 0.16)
-        parts.append(superellipsoid((roof_middle, 0, h + 0.11), half_box, (0.5, 0.5), steps=(16, 9)))
+        half_box = (min(0.75, 0.5 * roof), 0.32, 0.16)
+        parts.append(superellipsoid((middle, 0, h + 0.13), half_box, (0.5, 0.5), steps=(16, 9)))
     if shape.style in ("coupe", "sedan") and rng.random() < 0.12:
-        parts.append(box((-(shape.length - 0.15), 0, shape.belt_height + 0.16), (0.2, 0.75 * shape.width, 0.03)))
+        parts += _spoiler(shape, float(np.interp(shape.length - 0.18, profile[:, 0], profile[:, 1])))
     if shape.style == "suv" and rng.random() < 0.2:
         spare, faces = lathe((0, 0, 0), [(0, 0.1), (0.3, 0.1), (0.34, 0), (0.3, -0.1), (0, -0.1)], 20)
         parts.append((spare[:, [1, 0, 2]] + np.array([-shape.length - 0.06, 0, 0.62 * h]), faces))
+    if shape.style in ("sedan", "estate", "minivan") and rng.random() < 0.04:
+        parts.append(box((middle + 0.2 * roof, 0, h + 0.06), (0.16, 0.5, 0.14)))
+    if shape.style == "pickup" and rng.random() < 0.4:
+        length, height = shape.deck * rng.uniform(0.4, 0.8), rng.uniform(0.2, 0.7)
+        width = shape.width * rng.uniform(0.4, 0.65)
+        floor = 0.55 * shape.belt_height + 0.1
+        parts.append(box((-(shape.length - 0.12 - length / 2), 0, floor + height / 2), (length, width, height)))
     return parts
+
+
+def _spoiler(shape: CarShape, deck: float) -> list[Part]:
+    """A wing on two struts over the end of the boot lid, whose height is ``deck``."""
+    x = -(shape.length - 0.18)
+    strut = box((x, 0.28 * shape.width, deck + 0.06), (0.06, 0.03, 0.16))
+    return [box((x - 0.03, 0, deck + 0.14), (0.2, 0.72 * shape.width, 0.03)), strut, mirrored(strut)]
 
 
 def car(rng: np.random.Generator, style: Style | None = None) -> list[Part]:

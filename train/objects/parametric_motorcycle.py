@@ -148,7 +148,8 @@ def _bars(m: Machine, stem: Float64) -> tuple[list[Part], Float64]:
     grip = np.array([stem[0] - (0.05 if m.kind == "sport" else 0.16), m.bar_half - 0.05, m.bar_height])
     end = grip + vec(-0.02, 0.06, -0.01)
     side = tube(curve([stem, stem + vec(0.0, 0.1, 0.04), grip + vec(0.03, -0.1, 0), end], 10), 0.016, 7)
-    parts = [side, mirrored(side)]
+    clamp = tube([stem + vec(0, 0, -0.06), stem + vec(0, 0, 0.01)], 0.022, 6)
+    parts = [side, mirrored(side), clamp, box(stem - vec(0, 0, 0.05), (0.06, 0.24, 0.03))]
     mirror_at = grip + vec(0.10, 0.02, 0.17)
     mirror = superellipsoid(mirror_at, (0.02, 0.07, 0.045), (0.7, 0.7), steps=(10, 7))
     stalk = tube([grip + vec(0.03, -0.06, 0.01), mirror_at], 0.007, 5)
