@@ -88,7 +88,7 @@ def lobe_candidates(
     """Patches whose lobes may reach the radar from anywhere near a place; returns how many.
 
     Args:
-        facing: float32 [p, 7], centre, unit normal, least cosine between the normal and the half vector.
+        facing: float32 [7, p], centre, unit normal, least cosine between the normal and the half vector.
         eye: float64 [4], see ``patch_weights``.
         slack_rad: how far the half vector may turn until the next call.
         mark: uint8 [p], scratch.
@@ -97,20 +97,21 @@ def lobe_candidates(
     ex, ey, ez, gz = np.float32(eye[0]), np.float32(eye[1]), np.float32(eye[2]), np.float32(eye[3])
     turn_cosine, turn_sine = np.float32(math.cos(slack_rad)), np.float32(math.sin(slack_rad))
     one = np.float32(1.0)
-    for p in range(len(facing)):
-        dx, dy = ex - facing[p, 0], ey - facing[p, 1]
-        za, zb = ez - facing[p, 2], gz - facing[p, 2]
+    cx, cy, cz, nx, ny, nz, lc = facing[0], facing[1], facing[2], facing[3], facing[4], facing[5], facing[6]
+    for p in range(len(mark)):
+        dx, dy = ex - cx[p], ey - cy[p]
+        za, zb = ez - cz[p], gz - cz[p]
         flat = dx * dx + dy * dy
         ra, rb = one / np.sqrt(flat + za * za), one / np.sqrt(flat + zb * zb)
-        side = facing[p, 3] * dx + facing[p, 4] * dy
-        ca, cb = (side + facing[p, 5] * za) * ra, (side + facing[p, 5] * zb) * rb
-        cosine = facing[p, 6]
+        side = nx[p] * dx + ny[p] * dy
+        ca, cb = (side + nz[p] * za) * ra, (side + nz[p] * zb) * rb
+        cosine = lc[p]
         least = max(cosine * turn_cosine - np.sqrt(max(one - cosine * cosine, np.float32(0.0))) * turn_sine, 0)
         half2 = np.float32(2.0) * (one + (flat + za * zb) * ra * rb)
         both = (ca + cb) * (ca + cb) >= least * least * half2
         mark[p] = np.uint8((abs(ca) >= least) | (abs(cb) >= least) | both)
     count = 0
-    for p in range(len(facing)):
+    for p in range(len(mark)):
         index[count] = p
         count += mark[p]
     return count

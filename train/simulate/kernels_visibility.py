@@ -80,17 +80,14 @@ def rasterize(
         wb_u, wb_v = (cv - av) * scale, (au - cu) * scale
         wa_row = ((bu - low_u) * (cv - low_v) - (bv - low_v) * (cu - low_u)) * scale
         wb_row = ((cu - low_u) * (av - low_v) - (cv - low_v) * (au - low_u)) * scale
-        d_u = wa_u * (ia - ic) + wb_u * (ib - ic)
         first_u, width = int(low_u), int(high_u - low_u) + 1
         for v in range(int(low_v), int(high_v) + 1):
-            wa, wb = wa_row, wb_row
-            depth = ic + wa * (ia - ic) + wb * (ib - ic)
-            for u in range(width):
-                if wa >= 0.0 and wb >= 0.0 and wa + wb <= 1.0 and depth > inverse_depth[v, first_u + u]:
-                    inverse_depth[v, first_u + u] = depth
-                wa += wa_u
-                wb += wb_u
-                depth += d_u
+            line = inverse_depth[v, first_u : first_u + width]
+            for u in range(width):  # without branches: outlines are unpredictable
+                wa, wb = wa_row + u * wa_u, wb_row + u * wb_u
+                depth = ic + wa * (ia - ic) + wb * (ib - ic)
+                inside = (wa >= 0.0) & (wb >= 0.0) & (wa + wb <= 1.0)
+                line[u] = max(line[u], depth if inside else np.float32(0.0))
             wa_row += wa_v
             wb_row += wb_v
 

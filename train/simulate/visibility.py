@@ -120,13 +120,15 @@ class SceneVisibility:
         self._inverse[:] = 0.0
         kernels.rasterize(self._camera[number], surface.faces, focal, column, row, self._inverse)
         for other in range(len(views)):
-            may_hide = other == number or self._may_hide(other, number, views, eyes, middle)
-            if may_hide and other != number:
-                self._project(other, views[other].rotation, eyes[other], axes, np.zeros(4))
-                kernels.rasterize(self._camera[other], self._surfaces[other].faces, focal, column, row, self._inverse)
-            if may_hide and bit == SEEN_IN_GROUND:
-                # On its way down to the ground the wave meets the objects, in the image's space their images.
-                self._project(other, views[other].rotation, views[other].eye_m, axes * (1.0, 1.0, -1.0), np.zeros(4))
+            if other == number or not self._may_hide(other, number, views, eyes, middle):
+                continue
+            ways = [(eyes[other], axes)]
+            if bit == SEEN_IN_GROUND:
+                # On its way down to the ground the wave meets other objects; in the image's space, their images. What
+                # an object's own image hides of it is next to nothing.
+                ways.append((views[other].eye_m, axes * (1.0, 1.0, -1.0)))
+            for eye_m, mirrored in ways:
+                self._project(other, views[other].rotation, eye_m, mirrored, np.zeros(4))
                 kernels.rasterize(self._camera[other], self._surfaces[other].faces, focal, column, row, self._inverse)
         picture = (focal, column, row, self._inverse)
         for points, index, bias_m, seen in (

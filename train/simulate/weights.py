@@ -118,15 +118,15 @@ class Weigher:
         self._facing = [self._make_facing(one.patches) for one in surfaces]
 
     def _make_facing(self, patches: Patches) -> Float32:
-        """Centre, normal and least cosine of every patch's lobe, float32 [p, 7]."""
+        """Centre, normal and least cosine of every patch's lobe, float32 [7, p]."""
         lobe = LOBE * self._wavelength_m**2 / patches.area
         curved_cosine = 1.0 / np.sqrt(1.0 + 4.0 * MOST_EXPONENT * (lobe + patches.spread))
         sine = self._settings.lobe_end * self._wavelength_m / (4.0 * np.pi * np.sqrt(patches.area))
         flat_cosine = np.sqrt(np.maximum(1.0 - sine * sine, 0.0))
-        facing = np.empty((len(patches), 7), np.float32)
-        facing[:, :3], facing[:, 3:6] = patches.shape[:, 0], patches.shape[:, 1]
+        facing = np.empty((7, len(patches)), np.float32)
+        facing[:3], facing[3:6] = patches.shape[:, 0].T, patches.shape[:, 1].T
         least = np.where(patches.spread > CURVED_FROM * lobe, curved_cosine, flat_cosine)
-        facing[:, 6] = np.maximum(least, np.cos(np.radians(self._settings.lobe_most_deg)))
+        facing[6] = np.maximum(least, np.cos(np.radians(self._settings.lobe_most_deg)))
         return facing
 
     def candidates(self, number: int, eye_m: Float64, step_m: float) -> Int32:
@@ -135,7 +135,7 @@ class Weigher:
         near = np.clip(eye_m[:2], surface.low_m[:2], surface.high_m[:2])
         slack_rad = min(1.5 * step_m / max(float(np.hypot(*(near - eye_m[:2]))), step_m), 1.5)
         facing = self._facing[number]
-        count = lobe_candidates(facing, eye_m, slack_rad, self._mark, self._index)
+        count = lobe_candidates(facing, eye_m, slack_rad, self._mark[: facing.shape[1]], self._index)
         return self._index[:count].copy()
 
     def weigh(self, number: int, eye_m: Float64, candidates: Int32, patches_seen: UInt8, points_seen: UInt8) -> Entries:
