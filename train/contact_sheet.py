@@ -55,8 +55,10 @@ def _pyplot() -> Any:
 
 
 def object_sheet(meshes: Sequence[Mesh], path: Path, columns: int = 4) -> None:
-    """Side and oblique view of every mesh, with its size, as one PNG."""
+    """Side and oblique view of every mesh, with its size, as one PNG of 24 greys."""
     plt = _pyplot()
+    from PIL import Image  # comes with matplotlib
+
     rows = -(-len(meshes) // columns)
     figure, axes = plt.subplots(rows, 2 * columns, figsize=(4 * columns, 1.5 * rows), squeeze=False)
     for axis in axes.ravel():
@@ -70,6 +72,9 @@ def object_sheet(meshes: Sequence[Mesh], path: Path, columns: int = 4) -> None:
     figure.tight_layout(pad=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+    with Image.open(path) as picture:
+        small = picture.convert("L").quantize(24, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
 
 
 def _scatter(axis: Any, points: Float32, color: str, size: float, axes: tuple[int, int]) -> None:

@@ -236,7 +236,9 @@ def test_licences_are_carried_along(tmp_path: Path) -> None:
         data = json.dumps(json.loads(content) | {"asset": asset}).encode() if name.endswith("gltf") else content
         (glb.parent / name).write_bytes(data)
     block(root / "car" / "four", "d")
-    (root / "manifest.csv").write_text("file,licence,attribution,source_group\ncar/four/d.ply,CC-BY-4.0,D,studio\n")
+    (root / "manifest.csv").write_text(
+        "file,licence,attribution,source_group,provenance_grade\ncar/four/d.ply,CC-BY-4.0,D,studio,P\n"
+    )
     block(root / "car" / "five", "e")
     assert run("import", root, tmp_path / "out", "--licence", "CC-BY-NC-4.0") == 0
     got = {e.name.split("_")[0]: (e.licence, e.attribution, e.source_group) for e in read_manifest(tmp_path / "out")}
@@ -244,6 +246,8 @@ def test_licences_are_carried_along(tmp_path: Path) -> None:
     assert got["two"] == ("CC-BY-4.0", "B. Builder", "two")
     assert got["three"] == ("CC0-1.0", "Block, C. Creator", "C. Creator")
     assert got["four"] == ("CC-BY-4.0", "D", "studio")
+    grades = {e.name.split("_")[0]: e.provenance for e in read_manifest(tmp_path / "out")}
+    assert grades == {"one": "A", "two": "A", "three": "B", "four": "P", "five": "B"}  # a procedural one stays one
     assert got["five"] == ("CC-BY-NC-4.0", "e.ply", "five")
     assert "car/one_a: MIT; 2024 A. Author" in (tmp_path / "out" / "CREDITS.md").read_text()
     assert (tmp_path / "out" / "licences" / "car" / "two" / "LICENSE.txt").is_file()

@@ -29,6 +29,8 @@ def add_verbs(verbs: Any) -> None:
     sheet.add_argument("--count", type=int, default=24, help="parametric objects, or deformations of one object")
     sheet.add_argument("--parametric", action="store_true", help="parametric objects instead of a library")
     sheet.add_argument("--object", help="variations of one object instead, such as car/parametric_00000")
+    sheet.add_argument("--styles", action="store_true", help="with --parametric: a car of every body style instead")
+    sheet.add_argument("--together", action="store_true", help="all classes on one sheet")
     sheet.add_argument("--riders", action="store_true", help="put riders on the two-wheelers of a library")
     sheet.set_defaults(run=_sheet)
 
@@ -138,6 +140,7 @@ def _sheet(options: argparse.Namespace) -> int:
 
     from train.contact_sheet import object_sheet
     from train.objects.parametric import generate
+    from train.objects.parametric_car import STYLES
     from train.objects.reference import RIDDEN, ObjectRef
 
     options.out.mkdir(parents=True, exist_ok=True)
@@ -148,6 +151,9 @@ def _sheet(options: argparse.Namespace) -> int:
         sheets = {ref.to_text().replace("/", "_"): [ref.mesh(options.objects), *meshes]}
     elif options.parametric:
         sheets = {f"parametric_{name}": [generate(name, seed) for seed in range(options.count)] for name in names}
+        if options.styles and "car" in names:
+            cars = [replace(generate("car", k, style=style), object_id=style) for k, style in enumerate(STYLES)]
+            sheets["parametric_car"] = cars
     else:
         refs = _chosen(options)
         sheets = {}
@@ -159,6 +165,8 @@ def _sheet(options: argparse.Namespace) -> int:
                 print(error, file=sys.stderr)
                 mesh = ref.mesh(options.objects)
             sheets.setdefault(ref.class_name, []).append(mesh)
+    if options.together:
+        sheets = {"parametric" if options.parametric else "objects": [m for meshes in sheets.values() for m in meshes]}
     for name, meshes in sheets.items():
         object_sheet(meshes, options.out / f"{name}.png")
         print(options.out / f"{name}.png")

@@ -31,12 +31,14 @@ class Credit:
         attribution: author, title or copyright line.
         group: author or project, "" = not stated.
         sidecar: the file that says so, None = nothing found.
+        grade: how sure that is: A explicit, B an uploader's tag, C nothing found, or what a manifest says.
     """
 
     licence: str = UNKNOWN
     attribution: str = ""
     group: str = ""
     sidecar: Path | None = None
+    grade: str = "C"
 
 
 def find_credit(path: Path, root: Path, manifest: dict[str, dict[str, str]]) -> Credit:
@@ -49,7 +51,13 @@ def find_credit(path: Path, root: Path, manifest: dict[str, dict[str, str]]) -> 
     row = manifest.get(path.relative_to(root).as_posix())
     if row:
         licence, attribution = row.get("licence") or row.get("license") or UNKNOWN, row.get("attribution") or ""
-        return Credit(licence, attribution, row.get("source_group") or "", root / "manifest.csv")
+        return Credit(
+            licence,
+            attribution,
+            row.get("source_group") or "",
+            root / "manifest.csv",
+            row.get("provenance_grade") or "A",
+        )
     own = path.with_name(path.name + ".license")
     if own.is_file():
         return _from_text(own)
@@ -58,7 +66,7 @@ def find_credit(path: Path, root: Path, manifest: dict[str, dict[str, str]]) -> 
         author = str(asset.get("author") or asset.get("copyright") or "")
         words = (asset.get("title"), author, asset.get("source"))
         attribution = ", ".join(str(word) for word in words if word)
-        return Credit(_spdx(str(asset.get("license") or asset.get("copyright"))), attribution, author, path)
+        return Credit(_spdx(str(asset.get("license") or asset.get("copyright"))), attribution, author, path, "B")
     for folder in [path.parent, *path.parent.parents]:
         for pattern in _LICENCE_FILES:
             for file in sorted(folder.glob(pattern)):
@@ -98,7 +106,7 @@ def _from_text(file: Path) -> Credit:
     text = file.read_text(encoding="utf-8", errors="replace")
     holder = _HOLDER.search(text)
     attribution = holder["holder"].strip() if holder else ""
-    return Credit(_spdx(text), attribution, "", file)
+    return Credit(_spdx(text), attribution, "", file, "A")
 
 
 def _spdx(text: str) -> str:

@@ -118,9 +118,10 @@ def import_one(found: Found, root: Path, settings: ImportSettings, credits: dict
     vertices, faces = reduce_to(vertices, faces, settings.max_faces)
     credit = find_credit(found.path, root, credits)
     licence = settings.licence if credit.sidecar is None else credit.licence
+    grade = credit.grade if credit.sidecar else "B" if licence != "unknown" else "C"
     mesh = Mesh(
         stand(vertices.astype(np.float32)), faces.astype(np.int32), CLASSES.index(found.class_name),
-        f"{found.class_name}/{found.name}", credit.group or found.group, "B" if licence != "unknown" else "C",
+        f"{found.class_name}/{found.name}", credit.group or found.group, grade,
         licence, credit.attribution or found.path.name,
     )  # fmt: skip
     for axis, extent, (low, high) in zip(_EXTENTS, mesh.size_m, _SIZES_M[found.class_name], strict=True):
