@@ -6,12 +6,15 @@ from __future__ import annotations
 import math
 import os
 import signal
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from train.objects.reference import ObjectRef
 from train.objects.sampling import sample_surface
+from train.simulate.pool import guarded
 from train.simulate.recipe import Recipe
 from train.simulate.shards import Cloud
 from train.simulate.work import Item, Plan
@@ -25,6 +28,20 @@ def small_plan(seed: int = 0, **sizes: int) -> Plan:
     count = recipe.set.objects
     names = ("car", "bicycle", "motorcycle", "pedestrian")
     return Plan(recipe, seed, tuple(f"{names[k % 4]}/parametric_{k:05d}" for k in range(count)))
+
+
+class Here:
+    """A pool that works in this process; after ``stop_after`` items it raises what a user's Ctrl-C raises."""
+
+    def __init__(self, stop_after: int = 10**9) -> None:
+        self.left = stop_after
+
+    def run(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+        for item in items:
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            yield item, guarded(function, item)
 
 
 def fake_cloud(item: Item) -> Cloud:

@@ -9,37 +9,21 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from fake_clouds import counted_cloud, dying_cloud, fake_cloud, small_plan
+from fake_clouds import Here, counted_cloud, dying_cloud, fake_cloud, small_plan
 
 from edge.errors import ConfigError, RecordingError
 from train.objects.reference import ObjectRef
 from train.perturb import perturb
 from train.simulate.build import CREDITS, INDEX, build, export_clouds, make_cloud, shard_name
-from train.simulate.pool import LocalPool, guarded
+from train.simulate.pool import LocalPool
 from train.simulate.progress import Progress
 from train.simulate.shards import read_clouds, read_shard
 from train.simulate.work import Plan
-
-
-class Here:
-    """A pool that works in this process; ``stop_after`` items it raises what a user's Ctrl-C raises."""
-
-    def __init__(self, stop_after: int = 10**9) -> None:
-        self.left = stop_after
-
-    def run(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        for item in items:
-            self.left -= 1
-            if self.left < 0:
-                raise KeyboardInterrupt
-            yield item, guarded(function, item)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -95,7 +79,7 @@ def test_a_run_killed_at_any_moment_goes_on(whole: Path, tmp_path: Path) -> None
     target = tmp_path / "set"
     script = (
         f"import sys; from pathlib import Path; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "from fake_clouds import slow_cloud, small_plan\n"
+        "from fake_clouds import Here, slow_cloud, small_plan\n"
         "from train.simulate.build import build\nfrom train.simulate.pool import LocalPool\n"
         "if __name__ == '__main__':\n"
         "    build(small_plan(), Path(sys.argv[1]), LocalPool(1), slow_cloud)\n"
@@ -158,7 +142,7 @@ def test_two_builders_do_not_share_a_folder(tmp_path: Path) -> None:
 
 def test_what_cannot_be_made_is_recorded_with_its_reason(tmp_path: Path) -> None:
     target, said = tmp_path / "set", io.StringIO()
-    built = build(small_plan(), target, LocalPool(2), dying_cloud, Progress(said))
+    built = build(small_plan(), target, LocalPool(1), dying_cloud, Progress(said))
     assert (built.clouds, built.failed) == (18, 2)
     failed = {c.object: c.error for shard in read_clouds(target) for c in shard.clouds if c.error}
     assert failed == {

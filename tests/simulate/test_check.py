@@ -5,26 +5,19 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fake_clouds import fake_cloud, small_plan
+from fake_clouds import Here, fake_cloud, small_plan
 
 from edge.errors import RecordingError
 from train.simulate.build import INDEX, build, shard_name, write_index
 from train.simulate.check import check, implausible, show
-from train.simulate.pool import guarded
 from train.simulate.shards import Cloud, Shard, encode, read_shard
-
-
-class Here:
-    def run(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        for item in items:
-            yield item, guarded(function, item)
 
 
 @pytest.fixture

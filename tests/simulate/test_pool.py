@@ -99,6 +99,14 @@ def test_workers_end_with_a_caller_that_is_killed(tmp_path: Path) -> None:
     pytest.fail("the worker outlived its caller")
 
 
+def test_workers_that_cannot_start_are_an_error_and_not_the_items_fault(tmp_path: Path) -> None:
+    path = tmp_path / "script.py"
+    path.write_text("from train.simulate.pool import LocalPool\nprint(list(LocalPool(2).run(abs, range(50))))\n")
+    run = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 1
+    assert "a worker process ended before it began to work" in run.stderr
+
+
 def pid(_: int) -> int:
     return os.getpid()
 

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fake_clouds import fake_cloud, small_plan
+from fake_clouds import Here, fake_cloud, small_plan
 
 from edge.errors import ConfigError, RecordingError
 from train.dataset import CompletionDataset, DatasetSettings
@@ -18,18 +18,11 @@ from train.nearest import nearest_distance
 from train.objects.mesh import MeshError
 from train.objects.reference import ObjectRef
 from train.simulate.build import build, export_clouds, shard_name
-from train.simulate.pool import guarded
 from train.simulate.shards import Shard, encode, read_shard
 from train.simulated import SimulatedDataset
 
 SETTINGS = DatasetSettings(truth_points=2000, epoch_samples=40)
 EXACT = replace(SETTINGS, sight_sigma_deg=0.0, ground_sigma_m=0.0)
-
-
-class Here:
-    def run(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        for item in items:
-            yield item, guarded(function, item)
 
 
 @pytest.fixture(scope="module")

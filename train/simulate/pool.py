@@ -15,10 +15,12 @@ from multiprocessing.process import BaseProcess
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from edge.config import require
+from edge.errors import RfconstructError
 
 T = TypeVar("T")
 R = TypeVar("R")
 TRIES = 2
+_GREETING = "here"
 LIMIT_S = 900.0
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES}
@@ -49,6 +51,7 @@ class LocalPool:
         limit_s: an item that takes longer is stopped with its process.
     Raises:
         ConfigError: a number outside its range.
+        RfconstructError: in ``run``: processes cannot be started.
     """
 
     def __init__(self, workers: int = 0, limit_s: float = LIMIT_S) -> None:
@@ -71,6 +74,8 @@ class LocalPool:
                 if not busy:
                     return
                 for worker in _ready(busy, self.limit_s):
+                    if worker.began():
+                        continue
                     item, tries = worker.take()
                     answer = worker.answer(self.limit_s)
                     if isinstance(answer, Failure) and tries < TRIES:
@@ -110,6 +115,7 @@ class _Worker(Generic[T, R]):
         self.pipe: Connection
         self.job: tuple[T, int] | None = None
         self.since_s = 0.0
+        self._greeted = False
 
     def start(self, item: T, tries: int) -> None:
         """Begin with an item."""
@@ -118,6 +124,24 @@ class _Worker(Generic[T, R]):
         self.job, self.since_s = (item, tries), time.monotonic()
         with suppress(OSError):  # it died just now: the answer will say so
             self.pipe.send(item)
+
+    def began(self) -> bool:
+        """Whether the process has only just said that it is there; its time counts from now on.
+
+        Raises:
+            RfconstructError: it died before: no process can work here, so no item is to blame.
+        """
+        if self._greeted or not self.pipe.poll():
+            return False
+        try:
+            self._greeted = self.pipe.recv() == _GREETING
+        except (EOFError, OSError) as error:
+            raise RfconstructError(
+                "a worker process ended before it began to work",
+                action="look at its message above; a script must start the pool under if __name__ == '__main__'",
+            ) from error
+        self.since_s = time.monotonic()
+        return True
 
     def take(self) -> tuple[T, int]:
         """The job that is over."""
@@ -144,6 +168,7 @@ class _Worker(Generic[T, R]):
     def _launch(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
+        self._greeted = False
         self._process = context.Process(target=_serve, args=(other, self._function), daemon=True)
         with _for_workers():
             self._process.start()
@@ -180,6 +205,7 @@ def _for_workers() -> Iterator[None]:
 def _serve(pipe: Connection, function: Callable[[T], R]) -> None:
     """Answer items until the other end is gone."""
     with suppress(EOFError, OSError):
+        pipe.send(_GREETING)
         while True:
             pipe.send(guarded(function, pipe.recv()))
 
