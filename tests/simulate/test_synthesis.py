@@ -299,7 +299,7 @@ def test_unfocused_sidelobes_of_one_channel_per_element(range_m: float, expected
 @pytest.mark.parametrize("range_m", [3.0, 5.0, 10.0])
 @pytest.mark.parametrize("speed_m_s", [-18.0, 0.0, 7.0])
 def test_doubled_elements_give_the_speed(range_m: float, speed_m_s: float) -> None:
-    """Validation table, row 13: pairs of adjacent slots give +-21 m/s in one loop, the wave's curvature undone; else biased."""
+    """Validation table, row 13: pairs of adjacent slots give +-21 m/s in one loop, else the wave biases it."""
     radar = cascade()
     profile = radar.schedule.profile
     points = Scatterers.direct(ahead(radar, range_m), 2000.0, (speed_m_s, 0.0, 0.0))
