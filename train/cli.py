@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from edge.errors import ExitCode, ModelError, RfconstructError
 from train.objects.commands import add_verbs as object_verbs
 from train.simulate.command import add_verb
+from train.simulate.rig_command import add_verb as add_rig_verb
 
 if TYPE_CHECKING:
     from train.checkpoint import Checkpoint
@@ -64,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--simulated-share", type=float, default=0.5, help="of the training samples")
     fit.set_defaults(run=_fit)
     add_verb(verbs)
+    add_rig_verb(verbs)
     for name, run, text in (
         ("evaluate", _evaluate, "measure a model folder on held-out objects"),
         ("export", _export, "write a model folder from a checkpoint, measured, with card and manifest"),

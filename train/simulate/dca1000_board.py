@@ -117,6 +117,8 @@ class Dca1000Board:
         self.packet_delay_s: float | None = None
         self.recording, self.sent_bytes, self.packets = False, 0, 0
         self.eeprom: bytes | None = None
+        self.data_target = self.settings.data_target
+        """Where samples go; None: port 4098 (or the EEPROM's) of whoever sent the last command."""
         self._data_port = DATA_PORT
         self._faults, self._reset_radar = faults, reset_radar
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -349,8 +351,8 @@ class Dca1000Board:
                 self._socket.sendto(packet, self._peer)
 
     def _target(self) -> tuple[str, int] | None:
-        if self.settings.data_target is not None:
-            return self.settings.data_target
+        if self.data_target is not None:
+            return self.data_target
         return (self._peer[0], self._data_port) if self._peer is not None else None
 
     def _send_data(self, packet: bytes) -> None:

@@ -26,7 +26,7 @@ from train.simulate.dca1000_board import adc_bytes
 from train.simulate.demo_firmware import DemoConfiguration, DemoFirmware
 from train.simulate.faults import Fault, Faults, FaultyChannel
 from train.simulate.frame_faults import FrameFaults
-from train.simulate.supplies import FrameSupply
+from train.simulate.supplies import FrameSupply, SupplyClosedError
 from train.simulate.threads import JOIN_S, Bursts, Later, join
 
 PROMPT = "mmwDemo:/>"
@@ -93,6 +93,8 @@ class DemoRadar:
         device = DEVICES[self.settings.device]
         self.firmware, self.lines = DemoFirmware(device, self._begin, self._end), list[str]()
         self.next_number = self.bursts = 0
+        self.first_number: Callable[[], int] | None = None
+        """Asked for the number of the next frame when frames start; None: numbers go on where they stopped."""
         self.port = ""
         """Path of the terminal; "" while it is unplugged."""
         self._supply, self._lvds, self._frame_faults = supply, lvds, FrameFaults(faults, radar)
@@ -100,6 +102,7 @@ class DemoRadar:
         self._channel = FaultyChannel(faults, f"{radar}/cli", self._emit, self._later, self._pull)
         self._lock = threading.RLock()
         self._running: Bursts | None = None
+        self._dry: Bursts | None = None
         self._ended: list[Bursts] = []
         self._pending = b""
         self._master, self._slave = -1, -1
@@ -273,6 +276,8 @@ class DemoRadar:
         """Frames start, under the lock of the command line."""
         frame = configuration.frame
         assert frame is not None, "the firmware starts only a complete configuration"
+        if self.first_number is not None:
+            self.next_number = self.first_number()
         s = self.settings
         period_s = 1e-3 * frame.period_ms / (1.0 + 1e-6 * s.clock_ppm)
         wall_s = period_s / s.pace if s.pace > 0 else 0.0
@@ -292,9 +297,12 @@ class DemoRadar:
         number = self.next_number
         try:
             frames = self._frame_faults.of(self._supply(self.radar, number))
+        except SupplyClosedError:
+            return
         except CaptureError as error:
-            self.firmware.violations.append(f"no frame {number}: {error}")
-            frames = []
+            if self._dry is not bursts:
+                self.firmware.violations.append(f"no frame {number}: {error}")
+            self._dry, frames = bursts, []
         if self._running is not bursts or configuration.frame is None:
             return
         self.next_number += 1

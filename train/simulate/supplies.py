@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from edge.errors import CaptureError
-from edge.frames import RadarFrame, RadarId
+from edge.frames import Pose, RadarFrame, RadarId
+from edge.odometry.vehicle import rig_in_vehicle
 from edge.reference.point_targets import make_frame
 from edge.rig import Rig
 from train.simulate.threads import join
@@ -21,6 +23,7 @@ FrameSupply = Callable[[RadarId, int], RadarFrame]
 EPOCH_NS = 1_000_000_000
 """Instant of the horizontal radar's frame 0; any will do."""
 DEPTH = 8
+SPEED_M_S, POSE_RATE_HZ, POSES_BEFORE = 0.5, 100.0, 5
 
 
 def frame_time_ns(rig: Rig, radar: RadarId, number: int) -> int:
@@ -52,15 +55,17 @@ class CyclicSupply:
         return replace(frame, number=number, t_first_chirp_ns=frame_time_ns(self._rig, radar, number))
 
 
-def targets(rig: Rig, count: int = 4, seed: int = 0, noise_lsb: float = 25.0, step_m: float = 0.01) -> CyclicSupply:
-    """Three point targets at 3 to 8 m that pass by, ``count`` frames of each radar, repeated.
+def targets(
+    rig: Rig, count: int = 4, seed: int = 0, noise_lsb: float = 25.0, speed_m_s: float = SPEED_M_S
+) -> CyclicSupply:
+    """Three standing point targets at 3 to 8 m that are driven past, ``count`` frames of each radar, repeated.
 
     Args:
-        rig: radars.
+        rig: radars; the vehicle drives to the right of what they look at (yaw 90 degrees).
         count: different frames.
         seed: of places and noise.
         noise_lsb: standard deviation of each complex sample.
-        step_m: by which the targets move along -y of the rig from frame to frame.
+        speed_m_s: by which the targets pass along +y of the rig.
     """
     rng = np.random.default_rng(seed)
     range_m = rng.uniform(3.0, 8.0, 3)
@@ -69,10 +74,24 @@ def targets(rig: Rig, count: int = 4, seed: int = 0, noise_lsb: float = 25.0, st
     for index, (radar, board) in enumerate(rig.radars.items()):
         made[radar] = []
         for number in range(count):
-            places_m = np.stack([range_m, lateral * range_m - step_m * number, height * range_m], axis=1)
+            passed_m = speed_m_s * 1e-9 * (frame_time_ns(rig, radar, number) - EPOCH_NS)
+            places_m = np.stack([range_m, lateral * range_m + passed_m, height * range_m], axis=1)
             noise = np.random.default_rng((seed, index, number))
             made[radar].append(make_frame(board, places_m, 2000.0 / range_m**2, number, 0, None, noise_lsb, noise))
     return CyclicSupply(rig, made)
+
+
+def straight_poses(rig: Rig, speed_m_s: float = SPEED_M_S, rate_hz: float = POSE_RATE_HZ) -> Iterator[Pose]:
+    """Endless poses of a vehicle that drives along +x from just before the first frame, without error."""
+    position_m, attitude = rig_in_vehicle(rig.geometry)
+    for index in itertools.count(-POSES_BEFORE):
+        t_s = index / rate_hz
+        travelled_m = np.array([speed_m_s * t_s, 0.0, 0.0])
+        yield Pose(EPOCH_NS + round(t_s * 1e9), position_m + travelled_m, attitude.copy())
+
+
+class SupplyClosedError(CaptureError):
+    """Asked for a frame after the end."""
 
 
 class PreparedSupply:
@@ -137,7 +156,7 @@ class _Lane:
             self._aim(number)
             while not self._ready or self._ready[0][0] != number:
                 if self._closed:
-                    raise CaptureError("the frame supply was closed", value=number)
+                    raise SupplyClosedError("the frame supply was closed", value=number)
                 self._aim(number)
                 self._change.wait()
             _, frame = self._ready.popleft()

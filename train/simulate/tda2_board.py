@@ -23,7 +23,7 @@ from train.simulate.chip_commands import MASTER
 from train.simulate.faults import Fault, Faults, FaultyChannel
 from train.simulate.frame_faults import FrameFaults
 from train.simulate.rhcp import CHIP_SYNC, READ_SYNC
-from train.simulate.supplies import FrameSupply
+from train.simulate.supplies import FrameSupply, SupplyClosedError
 from train.simulate.tcp_server import OneClientServer
 from train.simulate.tda2_orders import ORDERS, check_target
 from train.simulate.tda2_protocol import AckType, FramingError, NackError, Opcode, Packet, PacketReader
@@ -94,6 +94,8 @@ class Tda2Board:
         self.violations: list[str] = []
         self.log: list[tuple[int, int]] = []
         self.next_number = self.bursts = 0
+        self.first_number: Callable[[], int] | None = None
+        """Asked for the number of the next frame when frames start; None: numbers go on where they stopped."""
         self.trace = b""
         self.gpio: dict[tuple[int, int], int] = {}
         self.connected, self.mapped = False, set[int]()
@@ -102,7 +104,7 @@ class Tda2Board:
         self._later, self._frame_faults = Later(f"{radar} board"), FrameFaults(faults, radar)
         self._running: Bursts | None = None
         self._ended_bursts: list[Bursts] = []
-        self._run = self._first_us = 0
+        self._run = self._dry_run = self._first_us = 0
         self._silent = False
         self._reader = PacketReader()
         self._control = FaultyChannel(faults, f"{radar}/control", self._write, self._later, self.unplug)
@@ -313,6 +315,8 @@ class Tda2Board:
             self.complain("frames were started before the recorder")
         frame = chip.frame
         assert frame is not None, "frames start only with a frame command"
+        if self.first_number is not None:
+            self.next_number = self.first_number()
         s = self.settings
         period_s = frame.period * FRAME_LSB_NS * 1e-9
         first_s = s.start_latency_s + self._frame_faults.late_s()
@@ -330,9 +334,12 @@ class Tda2Board:
         number = self.next_number
         try:
             frames = self._frame_faults.of(self._supply(self.radar, number))
+        except SupplyClosedError:
+            return
         except CaptureError as error:
-            self.complain(f"no frame {number}: {error}")
-            frames = []
+            if self._dry_run != run:
+                self.complain(f"no frame {number}: {error}")
+            self._dry_run, frames = run, []
         with self._lock:
             master = self.chips[0]
             if master.frame is None or self._running is None or run != self._run:
