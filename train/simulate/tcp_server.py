@@ -67,9 +67,10 @@ class OneClientServer:
     def hang_up(self) -> None:
         """Close the present client's connection."""
         with self._lock:
-            if self._client is not None:
-                _shut(self._client)
-                self._client = None
+            client, self._client = self._client, None
+        if client is not None:
+            _shut(client)
+            self._closed()
 
     def send(self, data: bytes, piece: int = 0) -> None:
         """Send to the present client, if there is one; in writes of ``piece`` bytes when it is not 0."""
@@ -93,6 +94,8 @@ class OneClientServer:
                 client, _ = self._listener.accept()
             except OSError:
                 return
+            if self._client is not None and _left(self._client):
+                self.hang_up()  # its thread has not noticed yet
             with self._lock:
                 welcome = self._client is None and self.accepting and not self._ending
                 if welcome:
@@ -111,13 +114,25 @@ class OneClientServer:
             while (data := client.recv(4096)) and session.feed(data):
                 pass
         with self._lock:
-            if self._client is client:
+            present = self._client is client
+            if present:
                 self._client = None
         client.close()
-        self._closed()
+        if present:
+            self._closed()
 
 
 def _shut(connection: socket.socket) -> None:
     """Wake whoever waits for this socket."""
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
+
+
+def _left(client: socket.socket) -> bool:
+    """Whether the other end has closed and everything it sent was read."""
+    try:
+        return client.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
