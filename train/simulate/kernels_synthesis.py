@@ -29,8 +29,8 @@ RX = 4
 CELLS = 4
 """Grid cells that are written in one step."""
 LANES = CELLS * RX
-LEG = 4 * LANES
-"""Floats of one scatterer's receive leg: weighted phasor (re, im), exponent of the weight over f, ratio of steps."""
+LEG_PLANES = 4
+"""Of receive legs, [capacity * LANES] each: weighted phasor (re, im), exponent of the weight over f, ratio of steps."""
 BLOCK = 32
 """Scatterers of a block: distances are taken receiver by receiver over a block, so that they vectorise."""
 
@@ -139,29 +139,31 @@ def transmit_legs(  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def _write_legs(legs, first, size, work, b, factors):  # type: ignore[no-untyped-def]
     """Lanes of a block of scatterers, from cosine, sine, place in the group and exp(b place) of every receiver."""
+    span = len(legs) // LEG_PLANES
     for i in range(size):
-        o = (first + i) * LEG
+        o = (first + i) * LANES
         for n in range(RX):
             cosine, sine, away, rise, fall = work[0, n, i], work[1, n, i], work[2, n, i], work[3, n, i], work[4, n, i]
             twice = rise * rise
             level, ratio = fall * fall * fall, twice * twice * twice * twice
             for c in range(CELLS):
                 lane, weight = o + c * RX + n, level * factors[0, c]
-                legs[lane], legs[lane + LANES] = weight * cosine, weight * sine
-                legs[lane + 2 * LANES] = float32(-2) * b * (away - float32(c) + float32(1.5))
-                legs[lane + 3 * LANES] = ratio * factors[1, c]
+                legs[lane], legs[lane + span] = weight * cosine, weight * sine
+                legs[lane + 2 * span] = float32(-2) * b * (away - float32(c) + float32(1.5))
+                legs[lane + 3 * span] = ratio * factors[1, c]
                 level *= twice
 
 
 @njit(inline="always")
 def _write_turns(turn, first, size, path, turns_s_per_m):  # type: ignore[no-untyped-def]
     """Cosines and sines of the turn per slot, in the order of the legs' lanes."""
+    span = len(turn) // 2
     for i in range(size):
-        o = (first + i) * 2 * LANES
+        o = (first + i) * LANES
         for n in range(RX):
             cosine, sine = _phasor(path[1, n, i] * turns_s_per_m)
             for lane in range(n, LANES, RX):
-                turn[o + lane], turn[o + LANES + lane] = cosine, sine
+                turn[o + lane], turn[o + span + lane] = cosine, sine
 
 
 @njit(**OPTIONS)
@@ -180,8 +182,8 @@ def receive_legs(  # type: ignore[no-untyped-def]
         timing: instants of the tangent and of slot 0, time from slot to slot (0: nothing moves): float64 [3].
         shape, edge: float32; of the weights, and distance from a scatterer to the first step's middle.
         factors: float32 [2, CELLS], of ``lane_factors``.
-        legs: float32 [chips, capacity * LEG], overwritten: state at slot 0.
-        turn: float32 [chips, capacity * 2 * LANES], overwritten: cosine and sine of the turn per slot.
+        legs: float32 [chips, LEG_PLANES * span], overwritten, span >= capacity * LANES: state at slot 0.
+        turn: float32 [chips, 2 * span], overwritten: cosine and sine of the turn per slot.
         cell: float32 [2, chips, capacity], overwritten: middle of the group's cells less ``base``, change per second.
         base: int32 [capacity], overwritten.
         reach: float64 [2, capacity], overwritten: shortest and longest leg.
@@ -242,6 +244,15 @@ def _plan(count, phasor, cell_out, mean, drift, base, width, b, outer, first_rat
         plan[3, k] = first_ratio * rising * rising
 
 
+@njit(inline="always")
+def _turn_legs(size, span, legs, turn):  # type: ignore[no-untyped-def]
+    """Receive phasors of one group to the next slot: one flat loop, which vectorises."""
+    for x in range(size):
+        re, im = legs[x], legs[x + span]
+        cosine, sine = turn[x], turn[x + span]
+        legs[x], legs[x + span] = re * cosine - im * sine, re * sine + im * cosine
+
+
 @cache
 def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[..., None]:
     """Kernel that adds scatterers to the grids of all groups.
@@ -253,12 +264,11 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
         moving: turn the legs from slot to slot.
     Returns:
         Kernel of (count, phasor [slots, 2, capacity], cell_out [slots, capacity], cell_back [2, chips, capacity],
-        time_s [slots] from the tangent's instant, base int32 [capacity], legs [chips, capacity * LEG], turn [chips,
-        capacity * 2 * LANES], drift float32 [capacity], plan float32 [4, capacity], start int32 [capacity], grid
-        float32 [chips * slots * 2 * plane]), the last three scratch, the grid added to.
+        time_s [slots] from the tangent's instant, base int32 [capacity], legs [chips, LEG_PLANES * span], turn [chips,
+        2 * span], drift float32 [capacity], plan float32 [4, capacity], start int32 [capacity], grid float32 [chips *
+        slots * 2 * plane]), the last three scratch, the grid added to.
     """
     steps, lanes, imaginary = np.uint64(width // 2), np.uint64(LANES), np.uint64(plane)
-    two, three, leg_size = np.uint64(2 * LANES), np.uint64(3 * LANES), np.uint64(LEG)
     edge = width - 2
     b, outer = np.float32(shape), np.float32(math.exp(-shape * edge * edge))
     first_ratio = np.float32(math.exp(8.0 * shape * edge - 16.0 * shape))
@@ -268,7 +278,7 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
     def spread(count, phasor, cell_out, cell_back, time_s, base, legs, turn, drift, plan, start, grid):  # type: ignore[no-untyped-def]
         slots, begin = len(time_s), uint64(0)
         for chip in range(len(legs)):
-            leg_table, turns = legs[chip], turn[chip]
+            leg_table, turns, span = legs[chip], turn[chip], uint64(legs.shape[1] // LEG_PLANES)
             mean, rate = cell_back[0, chip], cell_back[1, chip]
             for slot in range(slots):
                 t = float32(time_s[slot])
@@ -277,11 +287,14 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
                 _plan(count, phasor[slot], cell_out[slot], mean, drift, base, width, b, outer, first_ratio, plan, start)
                 for k in range(uint64(count)):
                     away, a, c, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
-                    o, leg = begin + uint64(start[k]), k * leg_size
+                    o, leg = begin + uint64(start[k]), k * lanes
                     for n in range(lanes):
-                        weight = _exp(away * leg_table[leg + two + n])
-                        step = ratio * leg_table[leg + three + n]
-                        cosine, sine = leg_table[leg + n], leg_table[leg + lanes + n]
+                        x = leg + n
+                        weight, step = (
+                            _exp(away * leg_table[x + span + span]),
+                            ratio * leg_table[x + span + span + span],
+                        )
+                        cosine, sine = leg_table[x], leg_table[x + span]
                         re, im = (a * cosine - c * sine) * weight, (a * sine + c * cosine) * weight
                         for j in range(steps):
                             grid[o + lanes * j + n] += re
@@ -289,12 +302,8 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
                             re *= step
                             im *= step
                             step *= bend
-                    if moving:
-                        for n in range(lanes):
-                            re, im = leg_table[leg + n], leg_table[leg + lanes + n]
-                            cosine, sine = turns[k * two + n], turns[k * two + lanes + n]
-                            leg_table[leg + n] = re * cosine - im * sine
-                            leg_table[leg + lanes + n] = re * sine + im * cosine
+                if moving:
+                    _turn_legs(uint64(count) * lanes, span, leg_table, turns)
                 begin += imaginary + imaginary
 
     return spread  # type: ignore[no-any-return]

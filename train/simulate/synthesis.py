@@ -23,7 +23,7 @@ from edge.waveform import SPEED_OF_LIGHT_M_S
 from train.simulate.kernels_synthesis import (
     BLOCK,
     LANES,
-    LEG,
+    LEG_PLANES,
     RX,
     filter_amplitudes,
     lane_factors,
@@ -46,6 +46,8 @@ FEWEST_SAMPLES = 64
 MARGIN = 16
 """Grid rows before the cell of range 0."""
 FIRST_ROOM = 1024
+APART = 80
+"""Floats between the planes of the legs, so that they do not compete for the same lines of the cache."""
 
 
 class RangeError(RfconstructError):
@@ -79,6 +81,7 @@ class _Work:
     def make(cls, room: int, slots: int, chips: int) -> _Work:
         """Zeroed buffers."""
         f4, f8 = np.float32, np.float64
+        span = room * LANES + APART
         return cls(
             room=room,
             points=np.zeros((2, 3, room), f8),
@@ -89,8 +92,8 @@ class _Work:
             cell_out=np.zeros((slots, room), f4),
             base_out=np.zeros(room, np.int32),
             reach_out=np.zeros((2, room), f8),
-            legs=zeros((chips, room * LEG), f4),
-            turn=zeros((chips, room * 2 * LANES), f4),
+            legs=zeros((chips, LEG_PLANES * span), f4),
+            turn=zeros((chips, 2 * span), f4),
             cell_back=np.zeros((2, chips, room), f4),
             base_back=np.zeros(room, np.int32),
             reach_back=np.zeros((2, room), f8),
