@@ -82,17 +82,19 @@ def _smooth(fine, kernel, begin, end, out):  # type: ignore[no-untyped-def]
 
 @njit(
     types.void(
-        *(float64[::1], int64[::1], float64[:, ::1], float64, float64, int64),
+        *(float64[::1], int64[::1], float64[:, ::1], float64, float64, int64, int64),
         *(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], float64[::1], int64[:, ::1]),
         float32[:, :, ::1],
     ),
     **OPTIONS,
 )
-def plan_spreading(position, slot, time, drift, middle, loops, density, taper, shape, fine, weight, first, taps):  # type: ignore[no-untyped-def]
+def plan_spreading(  # type: ignore[no-untyped-def]
+    position, slot, time, drift, middle, loops, rounds, density, taper, shape, fine, weight, first, taps
+):
     """Where every element stands by the time of its chirp, and its weight, spread on the grid of the row.
 
     Element n of loop l stands at position + drift t. Weights are the inverse density of elements, by the iteration
-    w <- w / (w * density)(x), times the taper over the moved aperture; they sum to 1.
+    w <- w / (w * density)(x), times the taper over the moved aperture; or as they are given. They sum to 1.
 
     Args:
         position: float64 [channel], in elements from the row's middle.
@@ -101,11 +103,12 @@ def plan_spreading(position, slot, time, drift, middle, loops, density, taper, s
         drift: elements per second.
         middle: grid cell of position 0.
         loops: loops used.
+        rounds: of the iteration; 0: ``weight`` is given, taper and all.
         density: float64 [odd], what counts as near, at FINE points an element.
         taper: float64 [m], window over the aperture, m points in equal steps from edge to edge.
         shape: float64 [fractions, TAPS], spreading function by the element's fraction of a cell.
         fine: float64 [2, FINE * cells + margins] scratch.
-        weight: float64 [loop * channel] scratch.
+        weight: float64 [loop * channel], given or scratch.
         first: int64 [loop, channel], receives the first of TAPS cells.
         taps: float32 [loop, channel, TAPS], receives the shares.
     """
@@ -115,10 +118,11 @@ def plan_spreading(position, slot, time, drift, middle, loops, density, taper, s
         for c in range(channels):
             x = position[c] + drift * time[l, slot[c]]
             lowest, highest = min(lowest, x), max(highest, x)
-            weight[l * channels + c] = 1.0
+            if rounds > 0:
+                weight[l * channels + c] = 1.0
     offset = middle * FINE + len(density) // 2
     begin, end = int(lowest * FINE + offset), int(highest * FINE + offset) + 2
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         fine[0] = 0.0
         for n in range(loops * channels):
             x = (position[n % channels] + drift * time[n // channels, slot[n % channels]]) * FINE + offset
@@ -133,7 +137,8 @@ def plan_spreading(position, slot, time, drift, middle, loops, density, taper, s
     total = 0.0
     for n in range(loops * channels):
         x = position[n % channels] + drift * time[n // channels, slot[n % channels]]
-        weight[n] *= taper[int((x - lowest + 0.5) / (highest - lowest + 1.0) * len(taper))]
+        if rounds > 0:
+            weight[n] *= taper[int((x - lowest + 0.5) / (highest - lowest + 1.0) * len(taper))]
         total += weight[n]
     for n in range(loops * channels):
         l, c = n // channels, n % channels  # noqa: E741

@@ -4,8 +4,8 @@
 A static point in direction u closes in by c(u) = v_x sqrt(1 - u^2) + v_along u. Within a sector around u_g, c is taken
 as c_g + c'_g (u - u_g), the tangent moved to the middle of the curve's bow: the constant turns each chirp's phase, the
 slope moves each transmitter by 2 c'_g t along the array. The moved elements stand on no grid any more; they are spread
-on it (non-uniform FFT, Dutt and Rokhlin 1993) with weights that make up for their density. Only v_x bends c(u), so
-travel along the array needs one sector at any speed.
+on it (non-uniform FFT, Dutt and Rokhlin 1993) with weights that make up for their density, for one loop with weights
+of level lobes (beam_weights.py). Only v_x bends c(u), so travel along the array needs one sector at any speed.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import numpy as np
 
 from edge.config import HeatmapSettings
 from edge.dsp import tables, tdm
-from edge.dsp.kernels_doppler import FINE, FRACTIONS, SPREAD_SHAPE, TAPS, plan_spreading, set_turns, spread
+from edge.dsp.beam_weights import BeamWeights, sector_closing_m_s
+from edge.dsp.kernels_doppler import FINE, FRACTIONS, ROUNDS, SPREAD_SHAPE, TAPS, plan_spreading, set_turns, spread
 from edge.dsp.kernels_heatmap import angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
 from edge.frames import BurstMotion, Float32, Float64
 
-BEND_RAD = 0.15
+BEND_RAD, ONE_LOOP_BEND_RAD = 0.15, 0.08
 """Phase of the first and last chirp by which c(u) may bow out of its tangent within a sector; half of it remains."""
 MOST_SECTORS = 16
 MARGIN = TAPS + 2
@@ -62,7 +63,7 @@ class Steering:
         self.count, self.bins = geometry.count, bins
         self._unit_m = geometry.pitch * wavelength_m
         self._cells = float(bins - geometry.count - 2 * MARGIN)
-        self._position = channels.element - 0.5 * (geometry.count - 1)
+        self._position = np.asarray(channels.element - 0.5 * (geometry.count - 1), dtype=np.float64)
         self._used = np.unique(channels.slot)
         self._sectors = tuple(tdm.divide(direction_cosine, count) for count in range(1, MOST_SECTORS + 1))
         fine = np.arange(-DENSITY_REACH * FINE, DENSITY_REACH * FINE + 1) / FINE
@@ -81,6 +82,9 @@ class Steering:
         loops, slots = time_s.shape
         self._fine = np.zeros((2, (bins + 2 * MARGIN) * FINE + len(self._density)))
         self._weight = np.zeros(loops * len(self._slot))
+        one_s, window = time_s[0, self._slot], tables.taper(settings, "angle", self.count, 0.5 * (self.count - 1))
+        one_s = one_s - 0.5 * (one_s.min() + one_s.max())
+        self._beam_weights = BeamWeights(self._position, one_s, window, geometry.pitch, wavelength_m)
         self._first = np.zeros((loops, len(self._slot)), dtype=np.int64)
         self._taps = np.zeros((loops, len(self._slot), TAPS), dtype=np.float32)
         self._centred_s = np.zeros((loops, slots))
@@ -122,24 +126,31 @@ class Steering:
         for sector in self.sectors(forward_m_s, loops):
             across = math.sqrt(1.0 - sector.centre**2)
             slope_m_s = along_m_s - forward_m_s * sector.centre / across
-            closing_m_s = forward_m_s * across + along_m_s * sector.centre + extra_m_s
-            bend_m_s = -0.5 * forward_m_s / across**3
-            closing_m_s += 0.5 * bend_m_s * sector.half_width**2
-            self._run_sector(cube, sector, closing_m_s, slope_m_s, loops, power)
+            closing_m_s = sector_closing_m_s(sector, sector.centre, forward_m_s, along_m_s) + extra_m_s
+            weight = self._beam_weights.of(sector, forward_m_s, along_m_s) if loops == 1 else None
+            self._run_sector(cube, sector, closing_m_s, slope_m_s, loops, weight, power)
         return BurstMotion(middle_s, forward_m_s, along_m_s)
 
     def sectors(self, forward_m_s: float, loops: int) -> tuple[tdm.Sector, ...]:
-        """Sectors in which the tangent departs from sqrt(1 - u^2), bent by 1.54 at u = 1/2, by BEND_RAD."""
+        """Sectors in which the tangent departs from sqrt(1 - u^2), bent by 1.54 at u = 1/2, by the limit."""
         first_s, last_s = float(self._time_s[0, self._used[0]]), float(self._time_s[loops - 1, self._used[-1]])
         half_s = 0.5 * (last_s - first_s)
         bend_rad = 4.0 * math.pi / self._wavelength_m * 1.54 * abs(forward_m_s) * half_s
-        if bend_rad * tdm.FOV_COSINE**2 <= 2.0 * BEND_RAD:
+        most_rad = ONE_LOOP_BEND_RAD if loops == 1 else BEND_RAD
+        if bend_rad * tdm.FOV_COSINE**2 <= 2.0 * most_rad:
             return self._sectors[0]
-        count = min(math.ceil(tdm.FOV_COSINE / math.sqrt(2.0 * BEND_RAD / bend_rad)), MOST_SECTORS)
+        count = min(math.ceil(tdm.FOV_COSINE / math.sqrt(2.0 * most_rad / bend_rad)), MOST_SECTORS)
         return self._sectors[count - 1]
 
     def _run_sector(
-        self, cube: Float32, sector: tdm.Sector, closing_m_s: float, slope_m_s: float, loops: int, power: Float32
+        self,
+        cube: Float32,
+        sector: tdm.Sector,
+        closing_m_s: float,
+        slope_m_s: float,
+        loops: int,
+        weight: Float64 | None,
+        power: Float32,
     ) -> None:
         span_s = float(self._centred_s[loops - 1, self._used[-1]] - self._centred_s[0, self._used[0]])
         most = self._cells / max(span_s, 1e-9)
@@ -150,8 +161,11 @@ class Steering:
         middle, shape, gain = float(row.shape[1] // 2), self._shape, self._gain
         if travel < STILL_CELLS:
             middle, shape, gain, drift = middle - 0.5 * (1 - self.count % 2), self._still_shape, self._still_gain, 0.0
+        rounds = ROUNDS if weight is None else 0
+        if weight is not None:
+            self._weight[: len(weight)] = weight
         plan_spreading(
-            *(self._position, self._slot, self._centred_s, drift, middle, loops),
+            *(self._position, self._slot, self._centred_s, drift, middle, loops, rounds),
             *(self._density, self._taper, shape, self._fine, self._weight, self._first, self._taps),
         )
         set_turns(self._turn, self._centred_s, closing_m_s - slope_m_s * sector.centre, self._wavelength_m)

@@ -46,6 +46,7 @@ def steered_power(
     loops: int,
     velocity_m_s: tuple[float, float],
     sectors: Sequence[tuple[float, float, int, int]],
+    weights: Sequence[Float64] = (),
 ) -> Float64:
     """Power over direction cosine and range with the rig's motion undone for a static scene.
 
@@ -58,6 +59,7 @@ def steered_power(
         loops: loops that are used.
         velocity_m_s: along boresight and along the array.
         sectors: (centre u_g, half width h, first row, last row + 1).
+        weights: [channel] of one loop by sector, slot by slot, in the place of the density weights.
     Returns:
         float64 [angle, range].
     """
@@ -74,12 +76,13 @@ def steered_power(
     u = direction_cosines(radar, settings)
     power = np.zeros((len(u), spectrum.shape[-1]))
     forward, along = velocity_m_s
-    for centre, half_width, first, last in sectors:
+    for n, (centre, half_width, first, last) in enumerate(sectors):
         across = np.sqrt(1.0 - centre**2)
         slope, closing = along - forward * centre / across, forward * across + along * centre
         closing -= 0.25 * forward / across**3 * half_width**2
         moved_m = p[None, :] + 2.0 * slope * time_s
-        weight = density_weights(moved_m.ravel() / unit_m, settings).reshape(moved_m.shape)
+        chosen = weights[n] if weights else density_weights(moved_m.ravel() / unit_m, settings)
+        weight = (chosen / chosen.sum()).reshape(moved_m.shape)
         rows = u[first:last, None, None]
         path_m = p * rows + 2.0 * (closing + slope * (rows - centre)) * time_s
         steering = weight * np.exp(2j * np.pi / wavelength_m * path_m)

@@ -59,11 +59,9 @@ class TestSidelobes:
     def test_at_speed_as_standing_still(self, imager, radar, angle_deg):
         still = sidelobe_db(seen(imager, radar, angle_deg, (0.0, 0.0)).power)
         assert still == pytest.approx(-13.0, abs=0.4)
-        for velocity in (WALKING, FORWARD, ALONG):
+        for velocity in (WALKING, FORWARD, ALONG, BACKWARD):
             assert sidelobe_db(seen(imager, radar, angle_deg, velocity).power) < still + 1.0
             assert imager.last_report.loops == radar.schedule.loops
-        gap_db = 1.5 if radar.schedule.loops == 1 else 1.0
-        assert sidelobe_db(seen(imager, radar, angle_deg, BACKWARD).power) < still + gap_db
 
     def test_motion_left_alone_spoils_them(self, imager, radar):
         frame = make_frame(radar, [place(6.0, -20.0)], 1e3, 0, 0, velocity_rig_m_s=[0.0, 10.0, 0.0])
@@ -78,7 +76,7 @@ class TestSidelobes:
 
     @pytest.mark.parametrize("velocity", [ALONG, BACKWARD])
     def test_hann_with_eight_loops_at_ten_metres_a_second(self, velocity):
-        """The moved loops fill each other's gaps; one loop alone has gaps of 0.73 wavelengths and cannot."""
+        """The moved loops fill each other's gaps, those of one loop stay (test_beam_weights.py)."""
         radar = cascade_radar(loops=8)
         imager = Imager(radar, STEER, FLAT)
         for angle_deg in (-40.0, -20.0, 0.0, 10.0, 35.0):
@@ -124,7 +122,9 @@ def test_steered_power_agrees_with_the_definition(loops, velocity):
     frame = make_frame(radar, points, 1e3, 0, 0, velocity_rig_m_s=velocity_rig, noise_lsb=25.0)
     power = imager.process(frame, velocity_rig).power
     sectors = [(s.centre, s.half_width, s.first, s.last) for s in imager._steering.sectors(velocity[0], loops)]
-    expected = steered_power(radar, frame, settings, AntennaSettings(), loops, velocity, sectors)
+    beam_weights, used = imager._steering._beam_weights, imager._steering.sectors(velocity[0], loops)
+    weights = [beam_weights.of(sector, *velocity) for sector in used] if loops == 1 else []
+    expected = steered_power(radar, frame, settings, AntennaSettings(), loops, velocity, sectors, weights)
     rows = np.abs(imager.direction_cosine) < tdm.FOV_COSINE
     error = np.abs(np.sqrt(power) - np.sqrt(expected))[rows]
     assert error.max() < 2e-3 * np.sqrt(expected[rows].max())
