@@ -33,6 +33,12 @@ def add_verbs(verbs: Any) -> None:
     sheet.add_argument("--together", action="store_true", help="all classes on one sheet")
     sheet.add_argument("--riders", action="store_true", help="put riders on the two-wheelers of a library")
     sheet.set_defaults(run=_sheet)
+    look = inner.add_parser("oracle", help="distance of unseen objects to the nearest training object, with variations")
+    look.add_argument("--objects", type=Path, help="library folder (default: the project's)")
+    look.add_argument("--class", dest="class_name", choices=CLASSES, default="car")
+    look.add_argument("--variants", type=int, default=6, help="of every training object")
+    look.add_argument("--points", type=int, default=1500, help="of each cloud")
+    look.set_defaults(run=_oracle)
 
 
 def _add_import(inner: Any) -> None:
@@ -170,6 +176,17 @@ def _sheet(options: argparse.Namespace) -> int:
     for name, meshes in sheets.items():
         object_sheet(meshes, options.out / f"{name}.png")
         print(options.out / f"{name}.png")
+    return int(ExitCode.OK)
+
+
+def _oracle(options: argparse.Namespace) -> int:
+    from train.objects.oracle import oracle
+
+    print(f"{'training objects':24} {'number':>7} {'median cm':>10} {'largest cm':>11}")
+    for name, count, median_m, largest_m in oracle(
+        options.class_name, options.variants, options.points, options.objects
+    ):  # fmt: skip
+        print(f"{name:24} {count:7} {100 * median_m:10.2f} {100 * largest_m:11.2f}", flush=True)
     return int(ExitCode.OK)
 
 
