@@ -55,7 +55,15 @@ def _row(figure: Any, count: int) -> list[Any]:
     return list(np.atleast_1d(figure.subplots(1, count, width_ratios=ratios)).ravel())
 
 
-def heatmap_panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, limit_m: float, fov_rad: float) -> None:
+def heatmap_panel(
+    figure: Any,
+    axes: Any,
+    heatmap: Heatmap,
+    found: Detections,
+    limit_m: float,
+    fov_rad: float,
+    span_db: float = DYNAMIC_RANGE_DB,
+) -> None:
     """One radar's heatmap and detections up to ``limit_m`` into ``axes``, with a colour bar of ``figure``."""
     from_above = heatmap.radar == "horizontal"
     power_db, along_m, forward_m = _cartesian(heatmap, limit_m)
@@ -70,7 +78,7 @@ def heatmap_panel(figure: Any, axes: Any, heatmap: Heatmap, found: Detections, l
     mesh = axes.pcolormesh(
         *(*corners, power_db),
         cmap="magma",
-        vmin=top_db - DYNAMIC_RANGE_DB,
+        vmin=top_db - span_db,
         vmax=top_db,
         shading="flat",
         rasterized=True,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import require
-from edge.frames import Float32, Float64, FusedCloud, ObjectCloud, Pose
+from edge.frames import RADARS, Float32, Float64, FusedCloud, ObjectCloud, Pose
 from edge.odometry.transforms import rotation_matrix
 from edge.pipeline import FrameResult, Pipeline, Sink, WindowResult
 from edge.rig import Rig, load_rig
@@ -133,11 +133,13 @@ def simulate_cloud(spec: DriveSpec) -> SimulatedCloud:
     """Drive past the object and return its cloud; the same spec gives the same cloud.
 
     Raises:
-        ConfigError: no such rig, or ranges that cannot work.
+        ConfigError: no such rig, a rig of one radar (it sees no height), or ranges that cannot work.
         MeshError: no such object.
     """
     mesh = spec.object.mesh()
     drive = make_drive(spec, mesh)
+    radars = drive.rig.radars
+    require(len(radars) == len(RADARS), f"radars of rig {spec.rig}", ", ".join(radars), " and ".join(RADARS))
     windows = Windows()
     run(drive, [windows])
     return observe(spec, mesh, drive, windows.results)

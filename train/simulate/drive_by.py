@@ -16,6 +16,7 @@ from edge.odometry.transforms import multiply, rotation_matrix
 from edge.odometry.vehicle import rig_in_vehicle
 from edge.rig import Radar, Rig
 from edge.sources.base import Loss
+from edge.timing import StageTimes
 from train.simulate.front_end import FrontEnd
 from train.simulate.odometry_error import reported_poses
 from train.simulate.optics import SceneOptics
@@ -47,6 +48,7 @@ class DriveBy:
     Attributes:
         rig: as the pipeline must know it.
         frames: of each radar.
+        times: of the stages "optics" and "synthesis", one measurement for every frame made.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class DriveBy:
     ) -> None:
         track = settings.track
         self.settings, self.seed, self.placed = settings, seed, tuple(placed)
+        self.times = StageTimes()
         self.frames = -(-track.frames // track.every)
         schedules = {radar: board.schedule for radar, board in rig.radars.items()}
         self._period_s = track.frame_period_s or max(s.frame_period_s for s in schedules.values())
@@ -131,11 +134,13 @@ class DriveBy:
             )
         t_ns = self.t_first_chirp_ns(radar, number)
         synthesizer = self._synthesizers[radar]
-        scatterers, ground = self._optics.scatterers(
-            *(radar, self.seconds(t_ns), self._position_m(t_ns), self._rotation, self._velocity_m_s),
-            synthesizer.reach_m,
-        )
-        return synthesizer.frame(scatterers, self._front_ends[radar], number, t_ns, ground)
+        with self.times.measure("optics"):
+            scatterers, ground = self._optics.scatterers(
+                *(radar, self.seconds(t_ns), self._position_m(t_ns), self._rotation, self._velocity_m_s),
+                synthesizer.reach_m,
+            )
+        with self.times.measure("synthesis"):
+            return synthesizer.frame(scatterers, self._front_ends[radar], number, t_ns, ground)
 
     def true_pose(self, t_ns: int) -> Pose:
         """Where the rig is."""

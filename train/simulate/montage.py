@@ -14,7 +14,7 @@ from edge.errors import RfconstructError
 from edge.frames import RADARS, Detections, Float32, FusedCloud, Heatmap, ObjectCloud, Pose, RadarId
 from edge.odometry.transforms import rotation_matrix
 from edge.pipeline import FrameResult, WindowResult
-from edge.plot.collector import copy_heatmap, single_radar_points
+from edge.plot.collector import FOV_DEG, copy_heatmap, single_radar_points
 from edge.plot.figure import BOTH, COARSE, HORIZONTAL, VERTICAL, dress, new_figure, prepare_folder, write
 from edge.plot.heatmaps import heatmap_panel
 from edge.rig import Radar
@@ -29,6 +29,7 @@ MARGIN_M = 0.6
 TRUTH_POINTS = 4000
 TRUTH = "#c3c8cf"
 DPI = 85
+SPAN_DB = 35.0
 AROUND_M = 3.0
 """Heatmaps are drawn this far beyond the object."""
 
@@ -109,17 +110,16 @@ def montage(spec: DriveSpec, path: Path) -> SimulatedCloud:
 def _caption(made: SimulatedCloud) -> str:
     figures, scene = made.statistics, made.settings.scene
     return (
-        f"{figures.points} points in {made.frames} frames over {made.travel_m:.1f} m ({made.status}); "
-        f"{scene.side_m:.1f} m aside, {scene.neighbours} neighbours; {100 * figures.within_10cm:.0f} % within 10 cm of "
-        f"the surface, {100 * figures.within_20cm:.0f} % within 20 cm; {100 * figures.coverage:.0f} % of the visible "
-        f"surface covered; grey: true surface"
+        f"{scene.side_m:.1f} m aside, {scene.neighbours} neighbours; {made.frames} frames over {made.travel_m:.1f} m; "
+        f"{100 * figures.within_10cm:.0f} % of the points within 10 cm of the true surface (grey), "
+        f"{100 * figures.within_20cm:.0f} % within 20 cm"
     )
 
 
 def _top_row(row: Any, mesh: Mesh, made: SimulatedCloud, kept: Kept) -> None:
     from train.contact_sheet import shade
 
-    axes = row.subplots(1, 3, width_ratios=(1.15, 1.6, 0.85))
+    axes = row.subplots(1, 3, width_ratios=(1.0, 1.5, 1.15))
     sensor_m = made.truth_rotation.T @ (made.sensor_m - made.truth_translation_m)
     towards = sensor_m / np.linalg.norm(sensor_m[:2]) * 4.0
     axes[0].imshow(shade(mesh, (towards[0], towards[1], 1.2), 480, 300), cmap="gray", vmin=0, vmax=1)
@@ -127,7 +127,8 @@ def _top_row(row: Any, mesh: Mesh, made: SimulatedCloud, kept: Kept) -> None:
     axes[0].set_title("The object, from the radar's side", fontsize=10, loc="left")
     limit_m = float(np.linalg.norm(made.sensor_m)) + AROUND_M
     for axis, radar in zip(axes[1:], RADARS, strict=True):
-        heatmap_panel(row, axis, kept.heatmaps[radar], kept.detections[radar], limit_m, np.radians(45.0))
+        shown = kept.heatmaps[radar], kept.detections[radar]
+        heatmap_panel(row, axis, *shown, limit_m, np.radians(FOV_DEG), SPAN_DB)
 
 
 def _clouds(row: Any, mesh: Mesh, made: SimulatedCloud, kept: Kept, window: FusedCloud, cloud: ObjectCloud) -> None:
@@ -139,10 +140,10 @@ def _clouds(row: Any, mesh: Mesh, made: SimulatedCloud, kept: Kept, window: Fuse
     truth = sample_surface(mesh.vertices, mesh.faces, TRUTH_POINTS, rng) @ rotation.T + shift_m
     scan, _ = perturb(mesh, PerturbSettings(), rng, _sector(made))
     layers = (
-        ("Horizontal radar alone", HORIZONTAL, alone["horizontal"]),
-        ("Vertical radar alone", VERTICAL, alone["vertical"]),
-        ("Both: the pipeline's cloud", BOTH, cloud.xyz_m),
-        ("Perturbed geometry", COARSE, scan @ rotation.T + shift_m),
+        ("Horizontal alone", HORIZONTAL, alone["horizontal"]),
+        ("Vertical alone", VERTICAL, alone["vertical"]),
+        ("Both", BOTH, cloud.xyz_m),
+        ("Perturbed", COARSE, scan @ rotation.T + shift_m),
     )
     low, high = truth.min(axis=0) - MARGIN_M, truth.max(axis=0) + MARGIN_M
     views = (("from above", 0, 1), ("from the radar", 0, 2))

@@ -20,6 +20,8 @@ from train.simulate.surface_settings import SurfaceSettings
 
 Range = tuple[float, float]
 FRAME_PERIOD_S = 1.0 / 60.0
+CLUTTER_POINTS = 2048
+"""Two a square metre: fewer would stand out one by one, as no ground does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +45,11 @@ class Ranges:
         noise_lsb: of a complex sample, rms; only scales all amplitudes. noise_figure_db, gain_dbi: link budget.
         across_loss_db, across_edge_deg: true antenna pattern across the array; the pipeline believes the rig's.
         gain_spread_db, residual_deg, leakage: channel mismatch, calibration error, leakage over noise.
-        permittivity, ground_roughness_m, clutter_db: ground.
+        ground_share: how often there is ground. permittivity, ground_roughness_m, clutter_db: of it.
         reflection_db, diffuse_db, points_db, imbalance_scale, phong: surface.
         walk_m, yaw_walk_deg, tilt_deg, time_offset_s, mounting_deg, mounting_m: odometry; see ``OdometrySettings``.
-        windows, p_fa: tapers and false-alarm probabilities to choose from. focus_share: how often the near field is
-            focused.
+        windows, p_fa, ground_margin_m: tapers, false-alarm probabilities and lowest heights of points to choose from.
+            focus_share: how often the near field is focused.
     """
 
     frames: tuple[int, int] = (300, 400)
@@ -72,9 +74,10 @@ class Ranges:
     gain_spread_db: Range = (1.2, 3.9)
     residual_deg: Range = (0.0, 6.0)
     leakage: Range = (25.0, 95.0)
+    ground_share: float = 1.0
     permittivity: Range = (3.0, 5.0)
     ground_roughness_m: Range = (0.3e-3, 2e-3)
-    clutter_db: Range = (-25.0, -15.0)
+    clutter_db: Range = (-32.0, -18.0)
     reflection_db: Range = (-3.0, 0.0)
     diffuse_db: Range = (-3.0, 3.0)
     points_db: Range = (-3.0, 3.0)
@@ -87,13 +90,14 @@ class Ranges:
     mounting_deg: Range = (-0.5, 0.5)
     mounting_m: Range = (-0.005, 0.005)
     windows: tuple[WindowName, ...] = ("taylor", "taylor", "hann")
-    p_fa: tuple[float, ...] = (1e-4, 1e-5, 1e-6)
+    p_fa: tuple[float, ...] = (1e-5, 1e-5, 1e-6, 1e-8)
+    ground_margin_m: tuple[float, ...] = (0.0, 0.1)
     focus_share: float = 1.0
 
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
             value = getattr(self, name)
-            if name in ("windows", "p_fa"):
+            if name in ("windows", "p_fa", "ground_margin_m"):
                 require(len(value) > 0, f"ranges.{name}", value, "at least one")
             elif name.endswith("_share"):
                 require(0 <= value <= 1, f"ranges.{name}", value, "0..1")
@@ -159,8 +163,10 @@ def draw(ranges: Ranges, seed: int) -> SimulationSettings:
         ),
         optics=OpticsSettings(
             ground=GroundSettings(
+                enabled=take.happens("ground_share"),
                 permittivity=take.uniform("permittivity"),
                 roughness_m=take.log_uniform("ground_roughness_m"),
+                clutter_points=CLUTTER_POINTS,
                 clutter_db=take.uniform("clutter_db"),
             )
         ),
@@ -178,7 +184,10 @@ def draw(ranges: Ranges, seed: int) -> SimulationSettings:
             mounting_m=take.three("mounting_m"),
         ),
         processing=ProcessingSettings(
-            ranges.windows[take.index("windows")], ranges.p_fa[take.index("p_fa")], take.happens("focus_share")
+            ranges.windows[take.index("windows")],
+            ranges.p_fa[take.index("p_fa")],
+            take.happens("focus_share"),
+            ranges.ground_margin_m[take.index("ground_margin_m")],
         ),
     )
 

@@ -85,20 +85,24 @@ class ProcessingSettings:
         window: taper of range and angle; None: the rig's.
         p_fa: designed false-alarm probability of the CFAR; 0: the rig's.
         focus: near-field focusing.
+        ground_margin_m: points lower than this above the ground are removed; None: the rig's.
     """
 
     window: WindowName | None = None
     p_fa: float = 0.0
     focus: bool = True
+    ground_margin_m: float | None = None
 
     def applied(self, rig: Rig) -> Rig:
         """The rig with these settings."""
-        heatmap, cfar = rig.settings.heatmap, rig.settings.cfar
+        heatmap, cfar, association = rig.settings.heatmap, rig.settings.cfar, rig.settings.association
         if self.window is not None:
             heatmap = replace(heatmap, range_window=self.window, angle_window=self.window)
         heatmap = replace(heatmap, focus=heatmap.focus and self.focus)
         cfar = replace(cfar, p_fa=self.p_fa or cfar.p_fa)
-        return replace(rig, settings=replace(rig.settings, heatmap=heatmap, cfar=cfar))
+        if self.ground_margin_m is not None:
+            association = replace(association, ground_margin_m=self.ground_margin_m)
+        return replace(rig, settings=replace(rig.settings, heatmap=heatmap, cfar=cfar, association=association))
 
 
 @dataclass(frozen=True, slots=True)

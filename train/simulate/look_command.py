@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rfconstruct-train montage`` and ``clouds``: pictures and figures of simulated drive-bys."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from edge.errors import ExitCode
+
+
+def add_verbs(verbs: Any) -> None:
+    """Add the verbs to ``rfconstruct-train``'s parser."""
+    montage = verbs.add_parser("montage", help="one picture of a simulated drive-by for every class")
+    montage.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the PNG files")
+    montage.add_argument("--object", action="append", default=[], help="car/parametric_00000 or the like; repeatable")
+    montage.add_argument("--seed", type=int, default=0, help="of the drive-bys")
+    montage.set_defaults(run=_montage)
+    clouds = verbs.add_parser("clouds", help="figures of simulated clouds and times of the stages, for every class")
+    clouds.add_argument("--objects", type=int, default=6, help="drive-bys of every class")
+    clouds.add_argument("--without-ground", action="store_true", help="no ground paths and no ground clutter")
+    clouds.set_defaults(run=_clouds)
+    for verb in (montage, clouds):
+        verb.add_argument("--rig", default="cascade_demo", help="name or folder of a rig with two radars")
+        verb.add_argument("--every", type=int, default=3, help="only each n-th frame")
+
+
+def _montage(options: argparse.Namespace) -> int:
+    from train.simulate.montage import write_montages
+
+    for made in write_montages(options.out, options.object, options.seed, options.rig, options.every):
+        figures = made.statistics
+        print(
+            f"{made.spec.object}: {made.status}, {figures.points} points in {made.frames} frames, "
+            f"{100 * figures.within_10cm:.0f} % within 10 cm, {100 * figures.within_20cm:.0f} % within 20 cm of the "
+            f"surface, {100 * figures.coverage:.0f} % of the visible surface covered"
+        )
+    return int(ExitCode.OK)
+
+
+def _clouds(options: argparse.Namespace) -> int:
+    from train.simulate.cloud_report import report
+    from train.simulate.randomise import Ranges
+
+    ranges = Ranges(ground_share=0.0) if options.without_ground else Ranges()
+    report(options.objects, ranges, options.rig, options.every)
+    return int(ExitCode.OK)
