@@ -54,6 +54,7 @@ class Detector:
         """Detections of the last frame that were left out as sidelobes of stronger ones."""
         self._ring = (settings.guard_angle, settings.train_angle, settings.guard_range, settings.train_range)
         self._shape = (0, 0)
+        self._seen: tuple[Float32 | None, Float32 | None] = (None, None)
         self._bounds: tuple[Float32, ...] | None = None
         self._ends_m = (np.nan, np.nan)
         self._response: PointResponse | None = None
@@ -88,8 +89,7 @@ class Detector:
         self._estimate_ranks(heatmap, kept)
         self._refine(heatmap, kept)
         columns = self._columns[:, :kept].copy()
-        cells, ranges = self._cells[self._index[:kept]], heatmap.power.shape[1]
-        doppler = finish(heatmap, cells // ranges, cells % ranges, columns[0], columns[1])
+        doppler = finish(heatmap, self._cells[self._index[:kept]], columns[0], columns[1])
         return Detections(
             *(heatmap.radar, heatmap.number, heatmap.t_first_chirp_ns, columns[0], columns[1], columns[2]),
             *(doppler, columns[3]),
@@ -125,6 +125,9 @@ class Detector:
     def _prepare(self, heatmap: Heatmap) -> None:
         """Axes; buffers and tables are made again only when they change."""
         range_m, cosine = heatmap.range_m, heatmap.direction_cosine
+        if range_m is self._seen[0] and cosine is self._seen[1] and heatmap.power.shape == self._shape:
+            return
+        self._seen = range_m, cosine
         last = len(range_m) - 1
         self._axes[0], self._axes[1] = range_m[0], (float(range_m[last]) - float(range_m[0])) / last
         self._axes[2] = cosine[0]

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from edge.config import HeatmapSettings
 from edge.dsp import tables
+from edge.dsp.buffers import zeros
 from edge.dsp.kernels_doppler import doppler_fft, doppler_row, keep_larger, resolve_folds
 from edge.dsp.kernels_heatmap import angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
 from edge.frames import DopplerMaps, Float32, Heatmap
 
-ANGLE_LANES = 32
+ANGLE_LANES = 64
 LEAST_RANGE_M = 0.1
 
 
@@ -63,15 +64,15 @@ class DopplerFft:
         digits = size.bit_length() - 1
         self._place = [int(format(i % size, f"0{digits}b")[::-1], 2) if digits else 0 for i in k.tolist()]
         distances = max(1, len(channels.distance))
-        self._work = np.zeros((distances, 2, points), dtype=np.float32)
-        self._score = np.zeros(points, dtype=np.float32)
-        self._turn = np.zeros((slots, 2, points), dtype=np.float32)
-        self._row = np.zeros((2, geometry.count, points), dtype=np.float32)
+        self._work = zeros((distances, 2, points))
+        self._score = zeros(points)
+        self._turn = zeros((slots, 2, points))
+        self._row = zeros((2, geometry.count, points))
         self._angle_kernel = angle_kernel(bins, points, ANGLE_LANES)
         self._twiddle = tables.twiddles(bins, +1, 0)
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
-        self._angle_work = np.zeros(2 * bins * ANGLE_LANES, dtype=np.float32)
-        maps = np.zeros((size, bins, points), dtype=np.float32)
+        self._angle_work = zeros(2 * bins * ANGLE_LANES)
+        maps = zeros((size, bins, points))
         index = np.zeros((size, points), dtype=np.int8)
         delay_s = 0.5 * (loops - 1) * loop_time_s + 0.5 * loop_time_s * (slots - 1) / slots
         self.maps = DopplerMaps(maps, index, k * interval_m_s / size, interval_m_s, most, delay_s)
@@ -126,8 +127,7 @@ def speeds_m_s(maps: DopplerMaps, angle: NDArray[np.int64], range_bin: NDArray[n
 
 def finish(
     heatmap: Heatmap,
-    angle: NDArray[np.int64],
-    range_bin: NDArray[np.int64],
+    cells: NDArray[np.int64],
     range_m: Float32,
     direction_cosine: Float32,
 ) -> Float32:
@@ -137,7 +137,7 @@ def finish(
 
     Args:
         heatmap: in which they were detected.
-        angle, range_bin: int64 [n], their cells.
+        cells: int64 [n], their flat indices.
         range_m, direction_cosine: float32 [n], corrected in place.
     Returns:
         float32 [n] radial speed, positive away; NaN where it was not measured.
@@ -148,7 +148,7 @@ def finish(
         u -= motion.delay_s * (closing_m_s * u - motion.along_m_s) / np.maximum(range_m, LEAST_RANGE_M)
         range_m += motion.delay_s * closing_m_s
     if heatmap.doppler is None:
-        return np.full(len(angle), np.nan, dtype=np.float32)
-    speed_m_s = speeds_m_s(heatmap.doppler, angle, range_bin)
+        return np.full(len(cells), np.nan, dtype=np.float32)
+    speed_m_s = speeds_m_s(heatmap.doppler, *np.divmod(cells, heatmap.power.shape[1]))
     range_m -= np.float32(heatmap.doppler.delay_s) * speed_m_s
     return speed_m_s

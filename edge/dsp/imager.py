@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 SHORTEST_RANGE_M = 0.05
 ANGLE_LANES = 64
+STILL = np.zeros(1)
 LARGEST_MOTION_ERROR_RAD = 0.01
 """Motion's phase error over the row, rms at the edge of the field of view, that is left alone."""
 
@@ -103,10 +104,9 @@ class Imager:
         self._loop_stride = layout.slots * chirp
         starts = [d * layout.loops * self._loop_stride + s * chirp for s, d in pairs]
         self._block_start = np.array(starts, dtype=np.int64)
-        self._block_slot = np.array([s for s, _ in pairs[: self._row_blocks]], dtype=np.int64)
-        self._block_element = np.ascontiguousarray(
-            [by_block[s, d] for s, d in pairs[: self._row_blocks]], dtype=np.int64
-        )
+        row = pairs[: self._row_blocks]
+        self._block_slot = np.array([s for s, _ in row], dtype=np.int64)
+        self._block_element = np.ascontiguousarray([by_block[s, d] for s, d in row], dtype=np.int64)
         self._pairs = pairs
         interleaved = layout.kind == "cascade"
         slot, receiver = np.indices((layout.slots, layout.devices * layout.rx))
@@ -116,7 +116,7 @@ class Imager:
         self._channels = self.geometry.channels()
         index = self._channels.index(layout.slots, layout.devices * layout.rx)
         by_block = index.reshape(layout.slots, layout.devices, layout.rx)
-        self._block_channel = np.ascontiguousarray([by_block[s, d] for s, d in pairs[: self._row_blocks]])
+        self._block_channel = np.ascontiguousarray([by_block[s, d] for s, d in row])
         self._channel_step = layout.rx if interleaved else 2
         self._channel_word = 1 if interleaved else 2
 
@@ -219,6 +219,7 @@ class Imager:
             *(self.geometry, self._channels, self.settings, time_s, self._wavelength_m, self.points, self._gain),
             self.direction_cosine.astype(np.float64),
         )
+        self._still = self.choice(None)
 
     def choice(self, velocity_rig_m_s: Float64 | None) -> tdm.Choice:
         """What becomes of a burst's loops at this velocity; none given counts as standing still."""
@@ -261,7 +262,7 @@ class Imager:
             FrameRejected: all samples zero, or too many at the rails.
             PoseError: the velocity is no number.
         """
-        if frame.radar != self.radar.radar or frame.layout != self.layout:
+        if frame.radar != self.radar.radar or (frame.layout is not self.layout and frame.layout != self.layout):
             raise CaptureError(
                 f"{frame.radar} frame {frame.number} has another layout than the {self.radar.radar} radar's schedule",
                 value=frame.layout,
@@ -271,7 +272,7 @@ class Imager:
         adc = self._packed(frame)
         if all_zero(adc):
             raise reject_all_zero(frame)
-        choice = self.choice(velocity_rig_m_s)
+        choice = self._still if velocity_rig_m_s is None else self.choice(velocity_rig_m_s)
         by_loop = choice.name in ("steer", "fft")
         rails = self._run_loops(adc, choice) if by_loop else self._run_range(adc, choice.loops)
         self._report(adc, choice, rails)
@@ -289,10 +290,10 @@ class Imager:
             self._run_angle(self._sector)
             return heatmap
         forward_m_s, along_m_s, across_m_s = tdm.motion_m_s(velocity_rig_m_s, self.radar.radar)
-        speeds_m_s = self._across.speeds_m_s(across_m_s)
+        speeds_m_s = self._across.speeds_m_s(across_m_s) if across_m_s else STILL
         motion = self._undo_motion(choice, forward_m_s, along_m_s, float(speeds_m_s[0]), True)
         if len(speeds_m_s) == 1:
-            return replace(heatmap, motion=motion)
+            return heatmap if motion is None else replace(heatmap, motion=motion)
         self._across.keep(0, self._power)
         for k, speed_m_s in enumerate(speeds_m_s[1:].tolist(), 1):
             self._undo_motion(choice, forward_m_s, along_m_s, speed_m_s, False)
@@ -369,9 +370,8 @@ class Imager:
         beside = len(self._pairs) - self._row_blocks
         blocks = choice.loops * self._row_blocks + beside * (1 if choice.name in ("steer", "fft") else choice.loops)
         share = rails / (2 * blocks * layout.samples * layout.rx)
-        dead = dead_channels(
-            adc, self._channel_start, layout.samples, self._channel_step, self._channel_word, self._dead
-        )
+        channels = (self._channel_start, layout.samples, self._channel_step, self._channel_word)
+        dead = dead_channels(adc, *channels, self._dead)
         names = dead_names(self._dead, self.radar.schedule.transmitters) if dead else ()
         self.last_report = FrameReport(choice.loops, share, names, choice.name, choice.reason)
 

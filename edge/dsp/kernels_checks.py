@@ -9,7 +9,8 @@ import numpy as np
 from numba import boolean, int32, int64, njit, types, uint8
 
 RAW = types.Array(int32, 1, "C", readonly=True)
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
+# A microsecond each: to give the interpreter's lock away and wait for it again could take longer.
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "boundscheck": False, "cache": True}
 
 
 @njit(boolean(RAW), **OPTIONS)

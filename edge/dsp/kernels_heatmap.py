@@ -258,7 +258,7 @@ def row_kernel(points: int) -> Callable[..., Any]:
     return kernel
 
 
-@njit(types.void(complex64[::1], float64, float64[::1], float64, float64), **OPTIONS)
+@njit(types.void(complex64[::1], float64, float64[::1], float64, float64), **{**OPTIONS, "nogil": False})
 def set_phasors(phasor, radial_m_s, time_s, wavelength_m, loops):  # type: ignore[no-untyped-def]
     """Factors that undo a radial speed between slots: exp(-j 4 pi v t_s / lambda) / loops.
 
