@@ -71,13 +71,16 @@ def rasterize(
         if first_u > last_u or first_v > last_v:
             continue
         scale = 1.0 / area
+        step_a, step_b = (bv - cv) * scale, (cv - av) * scale  # barycentric weights are linear along a row
+        step_z = step_a * ia + step_b * ib - (step_a + step_b) * ic
         for v in range(first_v, last_v + 1):
+            start_a = (bu * (cv - v) - (bv - v) * cu) * scale
+            start_b = (cu * (av - v) - (cv - v) * au) * scale
+            start_z = start_a * ia + start_b * ib + (1.0 - start_a - start_b) * ic
             for u in range(first_u, last_u + 1):
-                wa = ((bu - u) * (cv - v) - (bv - v) * (cu - u)) * scale
-                wb = ((cu - u) * (av - v) - (cv - v) * (au - u)) * scale
-                wc = 1.0 - wa - wb
-                if wa >= 0 and wb >= 0 and wc >= 0:
-                    z = 1.0 / (wa * ia + wb * ib + wc * ic)
+                wa, wb = start_a + u * step_a, start_b + u * step_b
+                if wa >= 0 and wb >= 0 and 1.0 - wa - wb >= 0:
+                    z = 1.0 / (start_z + u * step_z)
                     if z < depth[v, u]:
                         depth[v, u] = z
                         hit[v, u] = f

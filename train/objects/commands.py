@@ -39,6 +39,7 @@ def add_verbs(verbs: Any) -> None:
     look.add_argument("--variants", type=int, default=6, help="of every training object")
     look.add_argument("--points", type=int, default=1500, help="of each cloud")
     look.set_defaults(run=_oracle)
+    inner.add_parser("time", help="CPU time of making, varying and perturbing objects").set_defaults(run=_time)
 
 
 def _add_import(inner: Any) -> None:
@@ -187,6 +188,14 @@ def _oracle(options: argparse.Namespace) -> int:
         options.class_name, options.variants, options.points, options.objects
     ):  # fmt: skip
         print(f"{name:24} {count:7} {100 * median_m:10.2f} {100 * largest_m:11.2f}", flush=True)
+    return int(ExitCode.OK)
+
+
+def _time(options: argparse.Namespace) -> int:
+    from train.objects.timing import timings
+
+    for what, mean_ms in timings():
+        print(f"{what:36} {mean_ms:7.2f} ms", flush=True)
     return int(ExitCode.OK)
 
 
