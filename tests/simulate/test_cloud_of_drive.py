@@ -32,6 +32,7 @@ CAR = ObjectRef("car", "parametric_00001")
 EASY = Ranges(
     frames=(90, 90), travel_m=(1.5, 1.5), speed_m_s=(0.5, 2.0), side_m=(4.0, 4.0), along_m=(0.0, 0.0),
     neighbours=(0, 0), wall_share=0.0, mover_share=0.0, windows=("taylor",), p_fa=(1e-5,), residual_deg=(2.0, 2.0),
+    ground_share=0.0, ground_margin_m=(0.0,),
 )  # fmt: skip
 CROOKED = replace(EASY, mounting_deg=(3.0, 3.0), mounting_m=(0.05, 0.05), time_offset_s=(0.1, 0.1), tilt_deg=(0.0, 0.0))
 
@@ -52,11 +53,11 @@ def drive(mesh: Mesh) -> DriveBy:
 
 
 def test_the_cloud_lies_on_the_true_surface(easy: SimulatedCloud, mesh: Mesh) -> None:
-    assert easy.status == "whole"
+    assert easy.status in ("whole", "split")
     assert easy.frames == 30
     assert easy.travel_m == pytest.approx(1.45, abs=0.05)
     assert easy.statistics.points == len(easy.xyz_m) == len(easy.power_db) == len(easy.frame_number) > 50
-    assert easy.statistics.within_20cm > 0.8
+    assert easy.statistics.within_20cm > 0.9
     assert easy.statistics.median_m < 0.08
     side_m = easy.truth_rotation.T @ (easy.sensor_m - easy.truth_translation_m)
     nearest_m = np.linalg.norm(mesh.vertices[:, :2] - side_m[:2], axis=1).min()
@@ -67,7 +68,7 @@ def test_the_cloud_lies_on_the_true_surface(easy: SimulatedCloud, mesh: Mesh) ->
 def test_the_truth_follows_mounting_and_time_errors(easy: SimulatedCloud) -> None:
     """3 degrees and 15 cm of wrong stamps move the cloud; the truth by the middle's pose moves with it."""
     made = simulate_cloud(DriveSpec(CAR, 11, CROOKED))
-    assert made.statistics.within_20cm > 0.75
+    assert made.statistics.within_20cm > 0.85
     tilt_deg = np.degrees(np.arccos(made.truth_rotation[2, 2]))
     assert 2.0 < tilt_deg < 6.0
     assert np.degrees(np.arccos(easy.truth_rotation[2, 2])) < 1.5
