@@ -232,6 +232,25 @@ def test_wrong_commands(make: Make) -> None:
     assert card.log == [3, 3, 3, 0x0B, 0x0B, 7, 9, 9, 5, 5]
 
 
+def test_any_bytes_leave_the_card_alive(make: Make) -> None:
+    rng = np.random.default_rng(1)
+    card, peer = make()
+    for k in range(300):
+        data = rng.integers(0, 256, int(rng.integers(0, 30)), dtype=np.uint8).tobytes()
+        code = int(rng.integers(0, 16))
+        whole = struct.pack("<3H", 0xA55A, code, len(data)) + data + b"\xaa\xee"
+        peer.command.sendto(whole if k % 2 else data, card.address)
+    peer.command.settimeout(0.05)
+    answers = 0
+    try:
+        while peer.command.recv(64):
+            answers += 1
+    except TimeoutError:
+        peer.command.settimeout(SAFETY_S)
+    assert answers >= 100
+    assert peer.ask(9) == reply(9)
+
+
 def test_deaf_after_configuration(make: Make) -> None:
     _, peer = make(deaf_s=0.05)
     assert peer.ask(3, TWO_LANES) == reply(3)

@@ -20,6 +20,7 @@ from edge.errors import CaptureError
 from edge.frames import Layout, RadarFrame, RadarId
 from train.simulate.dca1000_board import Dca1000Board, Dca1000Settings
 from train.simulate.demo_cli import DemoRadar, DemoSettings
+from train.simulate.demo_firmware import ARGUMENTS
 from train.simulate.faults import Faults
 
 SAFETY_S = 20.0
@@ -70,7 +71,7 @@ class Terminal:
 
     def __init__(self, path: str) -> None:
         self.handle = os.open(path, os.O_RDWR | os.O_NOCTTY)
-        tty.setraw(self.handle)
+        tty.setraw(self.handle, termios.TCSANOW)  # what has been written already stays
         self.text = b""
 
     def close(self) -> None:
@@ -301,6 +302,14 @@ def test_faults_of_the_line(make: Make) -> None:
     os.write(terminal.handle, b"sensorStop\n")
     assert terminal.until(b"sensorStop\r\n") == b"sensorStop\r\n", "only the echo"
     assert terminal.silent()
+    faults.set("babble", "vertical/cli", times=1, value=300)
+    os.write(terminal.handle, b"sensorStop\n")
+    assert terminal.until(b"\r\n") == b"sensorStop\r\n"
+    while len(terminal.text) < 300:
+        terminal.text += os.read(terminal.handle, 4096)
+    assert len(terminal.text) == 300
+    assert b"\n" not in terminal.text
+    terminal.text = b""
     faults.set("delay", "vertical/cli", times=1, value=0.02)
     assert terminal.ask("sensorStop")[-1] == "Done"
     faults.set("garble", "vertical/cli", times=1, value=4)
@@ -330,6 +339,34 @@ def test_unplug_and_link(make: Make, tmp_path: Path) -> None:
         assert again.ask("queryDemoStatus")[0] == "Sensor State: 0", "it was in already"
     finally:
         again.close()
+
+
+def test_unplug_in_the_middle_of_the_frames(make: Make) -> None:
+    faults = Faults()
+    faults.set("unplug", "vertical/frames", skip=2, times=1)
+    radar, terminal, sink = make(faults)
+    configure(terminal)
+    os.write(terminal.handle, b"sensorStart\n")
+    eventually(lambda: radar.port == "")
+    assert len(sink.frames) == 2
+
+
+def test_any_bytes_leave_the_radar_alive(make: Make) -> None:
+    rng = np.random.default_rng(3)
+    radar, terminal, _ = make()
+    names = ["profileCfg", "chirpCfg", "frameCfg", "adcbufCfg", "channelCfg", "sensorStart", "lvdsStreamCfg", "cfarCfg"]
+    for k in range(60):
+        words = [str(word) for word in rng.choice(["nan", "-1", "1e400", "0", "3", "x"], int(rng.integers(0, 16)))]
+        noise = rng.integers(1, 256, int(rng.integers(0, 40)), dtype=np.uint8).tobytes().replace(b"\n", b"")
+        line = noise if k % 3 == 0 else " ".join([names[k % len(names)], *words]).encode()
+        os.write(terminal.handle, line + b"\n")
+        terminal.until()
+    for name, count in ARGUMENTS.items():
+        for word in ("nan", "inf", "-1", "1e9"):
+            assert radar.firmware.execute(f"{name} {' '.join([word] * count)}")[-1] in ("Done", "Error -1")
+    terminal.text = b""
+    termios.tcflush(terminal.handle, termios.TCIFLUSH)
+    assert radar.firmware.execute("sensorStop") == ["Ignored: Sensor is already stopped", "Done"]
 
 
 def test_a_reader_that_sleeps_holds_nothing_up(make: Make) -> None:

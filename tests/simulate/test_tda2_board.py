@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import struct
 import threading
 import time
@@ -622,6 +624,57 @@ def test_unplug_and_plug(make: Make) -> None:
         host.send(h.packet(0x12, 32, 0x10))
         with pytest.raises(TimeoutError):
             host.answer()
+
+
+def test_power_cut_in_a_recording(make: Make, tmp_path: Path) -> None:
+    """The reader finds whole frames and one that is cut; the index header never got its count."""
+    faults = Faults()
+    faults.set("unplug", "horizontal/frames", skip=3, times=1)
+    board = make(faults)
+    with Host(board.address) as host:
+        h.connect(host)
+        for device in DEVICES:
+            h.boot(host, device)
+            h.configure(host, device, LOOPS, SAMPLES, 10)
+        h.arm(host, LOOPS, SAMPLES, "one", 10)
+        for device in (8, 4, 2):
+            assert h.trigger(host, device, 1).refusal is None
+        host.spi(1, h.rhcp(1, 0x0A, host.sequence[1], [(0x0140, b"\1\0\0\0")]))
+        with pytest.raises(ConnectionError):
+            list(iter(host.receive, b""))
+    folder = tmp_path / "ssd" / "one"
+    items = list(CaptureFolder(folder, rig_of(), "horizontal"))
+    assert [type(item).__name__ for item in items] == ["RadarFrame", "RadarFrame", "Loss"]
+    assert struct.unpack_from("<I", (folder / "master_0000_idx.bin").read_bytes(), 12) == (0,)
+
+
+def test_any_bytes_leave_the_board_alive(make: Make) -> None:
+    """Random bytes, random packets with a right CRC, random messages with right check sums."""
+    rng = np.random.default_rng(11)
+    board = make()
+    for round_ in range(40):
+        eventually(lambda: board._server._client is None)
+        with Host(board.address) as host:
+            if round_ % 2:
+                h.connect(host)
+            if round_ == 1:
+                h.boot(host, 1)
+            for _ in range(12):
+                data = rng.integers(0, 256, int(rng.integers(0, 60)), dtype=np.uint8).tobytes()
+                opcode, device = int(rng.integers(0x10, 0x40)), int(rng.choice([1, 2, 8, 15, 32, 200]))
+                if round_ % 4 == 3:
+                    blocks = [(int(rng.choice([0x0080, 0x0100, 0x0101, 0x0102, 0x0140, 0x4080, 0x40C0])), data)]
+                    data, opcode, device = h.rhcp(1 + 4 * (_ % 2), blocks[0][0] >> 5, _, blocks), 0x23, 1
+                raw = h.packet(opcode, device, 1, data)
+                with contextlib.suppress(ConnectionError):
+                    host.send(raw if round_ % 4 else raw[: int(rng.integers(0, len(raw)))] + data)
+            with contextlib.suppress(OSError):
+                host.socket.shutdown(socket.SHUT_WR)
+                while host.socket.recv(4096):
+                    pass
+    eventually(lambda: board._server._client is None)
+    with Host(board.address) as host:
+        h.connect(host)
 
 
 def test_stopping_while_everything_runs(make: Make) -> None:

@@ -179,6 +179,7 @@ def test_single_chip_pair_streams(started: Any, single: tuple[Rig, CyclicSupply]
             card.order(9)
             card.order(5)
             terminal = Terminal(addresses[f"{radar}.cli"])
+            assert b"*****" in terminal.until()
             for line in cli_lines(rig.radars[radar].schedule):
                 assert terminal.ask(line)[-1] == "Done", line
             terminal.close()

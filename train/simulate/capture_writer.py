@@ -63,6 +63,11 @@ class CaptureWriter:
         for chip in self._chips:
             chip.close()
 
+    def cut(self) -> None:
+        """Power cut: the last frame's data are half written, the index headers still count 0 frames."""
+        for chip in self._chips:
+            chip.cut()
+
 
 class _ChipFiles:
     """The open pair of files of one chip."""
@@ -94,6 +99,14 @@ class _ChipFiles:
             self._data.close()
             self._index.seek(0)
             self._index.write(_HEADER.pack(b"bckt", _VERSION, 0, self._count, self._bytes))
+            self._index.close()
+        self._data = self._index = None
+
+    def cut(self) -> None:
+        if self._index is not None and self._data is not None:
+            width, height = self._writer._size
+            self._data.truncate(self._bytes - width * height)
+            self._data.close()
             self._index.close()
         self._data = self._index = None
 

@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from train.simulate import chip_commands as c
 from train.simulate.faults import Fault, Faults
@@ -217,7 +218,7 @@ class CascadeChip:
                 replies.append(SubBlock(block.identity, reply))
         self._answer(header, Kind.RESPONSE, tuple(replies))
         for block in blocks:
-            self._follow(block)
+            self._after(self._delays.answer_s, partial(self._follow, block))
 
     def _require(self, block: int) -> None:
         needed = c.NEEDS.get(block, ())

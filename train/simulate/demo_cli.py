@@ -293,6 +293,9 @@ class DemoRadar:
             self._ended.append(running)
 
     def _burst(self, bursts: Bursts) -> None:
+        if self._faults is not None and self._faults.hit(Fault.UNPLUG, self._frame_faults.where):
+            self.unplug()
+            return
         configuration = self.firmware.configuration
         number = self.next_number
         try:

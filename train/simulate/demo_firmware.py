@@ -319,5 +319,7 @@ _CHECKS: dict[str, Callable[[tuple[float, ...]], None]] = {
     "adcbufCfg": lambda n: _need(n[:2] == (-1.0, 0.0) and n[2] in (0, 1) and n[3:] == (1.0, 1.0), "ADC buffer"),
     "chirpCfg": _chirp,
     "frameCfg": _frame,
+    "cfarCfg": lambda n: _need(n[1] in (0, 1), "range (0) or Doppler (1)"),
+    "cfarFovCfg": lambda n: _need(n[1] in (0, 1), "range (0) or Doppler (1)"),
     "lvdsStreamCfg": lambda n: _need(n[0] == -1 and n[1] in (0, 1) and n[2] in (0, 1, 4) and n[3] in (0, 1), "LVDS"),
 }

@@ -39,6 +39,8 @@ class Fault(StrEnum):
     """Bits are flipped; value: how many."""
     TRUNCATE = "truncate"
     """It ends early; value: bytes that are missing (at most all)."""
+    BABBLE = "babble"
+    """Something else comes in its place, without an end of line; value: bytes."""
     SPLIT = "split"
     """TCP: written in pieces; value: bytes of a piece."""
     NACK = "nack"
@@ -63,6 +65,7 @@ _VALUES: dict[Fault, tuple[float, float, float]] = {
     Fault.DELAY: (0.05, 0.0, 3600.0),
     Fault.GARBLE: (1, 1, 4096),
     Fault.TRUNCATE: (1, 1, 2**31),
+    Fault.BABBLE: (4096, 1, 2**24),
     Fault.SPLIT: (1, 1, 2**16),
     Fault.NACK: (-1, -1, 0xFFFF),
     Fault.REFUSE: (6, 1, 0xFFFF),
@@ -219,7 +222,7 @@ def garble(packet: bytes, bits: int, rng: np.random.Generator) -> bytes:
 
 
 class FaultyChannel:
-    """Sends packets on, with the faults of one channel: one thread at a time sends.
+    """Sends packets on, with the faults of one channel; usable from several threads.
 
     Args:
         faults: rules; None: the channel is perfect.
@@ -257,6 +260,8 @@ class FaultyChannel:
             return
         if faults.hit(Fault.DROP, where):
             return
+        if other := faults.hit(Fault.BABBLE, where):
+            packet = other.rng.integers(0x20, 0x7F, int(other.value), dtype=np.uint8).tobytes()
         if cut := faults.hit(Fault.TRUNCATE, where):
             packet = packet[: max(0, len(packet) - int(cut.value))]
         if flipped := faults.hit(Fault.GARBLE, where):

@@ -152,11 +152,15 @@ class Tda2Board:
         self.violations.append(what)
 
     def unplug(self, silent: bool = False) -> None:
-        """Power cut: frames end, everything configured is lost. ``silent``: the connection stays open but dead."""
+        """Power cut: frames end in the middle of one, everything configured is lost.
+
+        Args:
+            silent: the connection stays open but dead, as when a cable is pulled.
+        """
         with self._lock:
             self._halt_bursts()
             self._silent, self._server.accepting = True, False
-            self.recorder.abandon()
+            self.recorder.abandon(cut=True)
             self.connected, self.mapped, self._lines, self._reading = False, set(), [False] * 4, [b""] * 4
             for chip in self.chips:
                 chip.power_off()
@@ -331,6 +335,9 @@ class Tda2Board:
 
     def _burst(self, run: int, k: int) -> None:
         """Burst k since start number ``run``, on the thread of the bursts."""
+        if self.faults is not None and self.faults.hit(Fault.UNPLUG, self._frame_faults.where):
+            self.unplug()
+            return
         number = self.next_number
         try:
             frames = self._frame_faults.of(self._supply(self.radar, number))

@@ -59,6 +59,7 @@ class Recorder:
         self.refused = 0
         self._roll_over, self._left, self._complain = roll_over_bytes, capacity_bytes, complain
         self._created = False
+        self._written: tuple[int, ...] = (0, 0, 0, 0)
         self._writer: CaptureWriter | None = None
         self._recording = False
 
@@ -71,8 +72,6 @@ class Recorder:
     def written(self) -> list[int]:
         """Frames of each chip in the present recording, or the last one."""
         return list(self._written) if self._writer is None else list(self._writer.frames)
-
-    _written: tuple[int, ...] = (0, 0, 0, 0)
 
     def set_size(self, chip: int, width: int, height: int) -> None:
         """Capture configuration of one chip. NackError: not possible."""
@@ -130,11 +129,14 @@ class Recorder:
             raise NackError("record stop without record start")
         self.abandon()
 
-    def abandon(self) -> None:
-        """The same without an order: the board is stopped or loses power after a last write."""
+    def abandon(self, cut: bool = False) -> None:
+        """The same without an order: the board is stopped, or (``cut``) loses power in the middle of a frame."""
         if self._writer is not None:
             self._written = tuple(self._writer.frames)
-            self._writer.close()
+            if cut:
+                self._writer.cut()
+            else:
+                self._writer.close()
         self._writer, self._recording, self._created = None, False, False
 
     def take(self, frame: RadarFrame, t_us: int, chips: list[int]) -> None:
