@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from edge.errors import ExitCode, ModelError, RfconstructError
 from train.objects.commands import add_verbs as object_verbs
+from train.simulate.bench_command import add_verb as add_bench_verb
 from train.simulate.command import add_verb
 from train.simulate.look_command import add_verbs as add_look_verbs
 from train.simulate.rig_command import add_verb as add_rig_verb
@@ -67,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     fit.set_defaults(run=_fit)
     add_verb(verbs)
     add_rig_verb(verbs)
+    add_bench_verb(verbs)
     add_look_verbs(verbs)
     for name, run, text in (
         ("evaluate", _evaluate, "measure a model folder on held-out objects"),
