@@ -79,7 +79,7 @@ def test_points_of_each_kind() -> None:
     count = np.bincount(made.points.kind, minlength=3)
     least, most = SurfaceSettings().car.points
     assert least <= count[ISOTROPIC] <= most
-    assert count[DIFFUSE] == 512
+    assert count[DIFFUSE] == SurfaceSettings().diffuse_points
     assert count[EDGE] == 12 * 20
     edge = made.points.kind == EDGE
     assert made.points.length[edge] == pytest.approx(np.full(240, 0.05), rel=1e-5)

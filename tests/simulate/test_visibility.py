@@ -13,6 +13,7 @@ from train.objects.mesh import Mesh
 from train.objects.primitives import box, capsule, join, torus
 from train.objects.sampling import Int32
 from train.simulate.kernels_optics import SEEN, SEEN_IN_GROUND
+from train.simulate.kernels_visibility import UInt8, may_hide
 from train.simulate.visibility import SceneVisibility, View
 
 Bool = NDArray[np.bool_]
@@ -39,6 +40,15 @@ def seen_by_rays(points: Float64, eye_m: Float64, vertices: Float32, faces: Int3
     return free
 
 
+def whole_sight(visibility: SceneVisibility, number: int, views: list[View], patches: int) -> UInt8:
+    """Bits of all patches of one object."""
+    every, bits = np.arange(patches, dtype=np.int32), np.zeros(patches, np.uint8)
+    hiders = visibility.hiders(number, views)
+    sight = visibility.look(number, views, hiders, True, every, np.empty((0, 3), np.float32))
+    bits[sight.candidates] = sight.patches
+    return bits
+
+
 def cart() -> Mesh:
     """A box on wheels with a mast and a rail: things that hide one another."""
     wheels = [torus((x, y, 0.3), 0.25, 0.05, 24, 6) for x in (-0.6, 0.6) for y in (-0.45, 0.45)]
@@ -63,7 +73,7 @@ def test_agrees_with_ray_casting(yaw_rad: float) -> None:
     views = [View(eye_m - p, -0.8, turn(y)) for p, y in zip(places, yaws, strict=True)]
     visibility = SceneVisibility([surface, surface], 320, 240)
     every = np.arange(len(surface.patches), dtype=np.int32)
-    visibility.update(views, True, [every, every], np.empty((0, 3), np.float32), np.empty(0, np.uint8))
+    bits = whole_sight(visibility, 0, views, len(every))
     # Both objects in the frame of the first one.
     across = turn(-yaws[0]) @ turn(yaws[1])
     other = surface.vertices.astype(np.float64) @ across.T + turn(-yaws[0]) @ (places[1] - places[0])
@@ -77,7 +87,7 @@ def test_agrees_with_ray_casting(yaw_rad: float) -> None:
         if bit == SEEN_IN_GROUND:
             # The way down to the ground meets the objects' images where the image's space is below it.
             expected &= seen_by_rays(points, eye, vertices * np.float32([1, 1, -1]), faces, 0.005)
-        found = visibility.patches[0][chosen] & bit > 0
+        found = bits[chosen] & bit > 0
         assert 0.05 < expected.mean() < 0.6
         assert (found == expected).mean() >= 0.97
 
@@ -89,14 +99,16 @@ def test_wall_hides_what_is_behind_it_and_nothing_beside() -> None:
     eye_m = np.array([0.0, 0.0, 0.8])
     places = [(0.0, 3.0, 0.0), (0.0, 5.0, 0.0), (4.5, 5.0, 0.0)]
     views = [View(eye_m - p, -0.8, np.eye(3)) for p in places]
-    every = [np.arange(len(s.patches), dtype=np.int32) for s in (wall, target, target)]
     clutter = np.array([[0.0, 5.0, -0.8], [0.0, 2.0, -0.8], [3.0, 5.0, -0.8]], np.float32)
-    seen = np.empty(3, np.uint8)
-    visibility.update(views, True, every, clutter, seen)
-    assert visibility.patches[0].any()
-    assert not visibility.patches[1].any()
-    assert visibility.patches[2].any()
-    assert seen.tolist() == [0, SEEN, SEEN]
+    assert [visibility.hiders(n, views) for n in (1, 2)] == [[0], []]
+    wall_bits, behind_bits, beside_bits = (
+        whole_sight(visibility, n, views, len(s.patches)) for n, s in enumerate((wall, target, target))
+    )
+    assert wall_bits.any()
+    assert not behind_bits.any()
+    assert beside_bits.any()
+    sight = visibility.look(0, views, [], False, np.empty(0, np.int32), clutter)
+    assert sight.clutter.tolist() == [0, SEEN, SEEN]
 
 
 def test_triangles_that_reach_behind_the_camera_do_no_harm() -> None:
@@ -105,8 +117,38 @@ def test_triangles_that_reach_behind_the_camera_do_no_harm() -> None:
     target = pure(Mesh(*join([box((0, 0, 0.5), (0.4, 0.4, 1.0))]), 0, "test/box"), 4.0)
     visibility = SceneVisibility([wall, target], 320, 160)
     views = [View(np.array([0.0, -2.0, 0.8]), -0.8, np.eye(3)), View(np.array([-3.0, -6.0, 0.8]), -0.8, np.eye(3))]
-    every = [np.arange(len(s.patches), dtype=np.int32) for s in (wall, target)]
-    visibility.update(views, False, every, np.empty((0, 3), np.float32), np.empty(0, np.uint8))
     front = wall.patches.flat[:, 1] < -0.04
-    assert (visibility.patches[0][front] == SEEN).mean() > 0.99
-    assert not visibility.patches[1].any()
+    assert (whole_sight(visibility, 0, views, len(front))[front] & SEEN > 0).mean() > 0.99
+    assert not whole_sight(visibility, 1, views, len(target.patches)).any()
+
+
+def test_only_what_stands_between_may_hide() -> None:
+    def square(x: float, y: float, half: float, yaw_rad: float = 0.0) -> Float64:
+        corner = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+        return corner @ turn(yaw_rad)[:2, :2].T + (x, y)
+
+    target = square(0.0, 6.0, 1.5, 0.3)
+    assert may_hide(square(0.5, 3.0, 0.4), target)
+    assert may_hide(square(1.2, 4.5, 0.4, 0.7), target)
+    assert not may_hide(square(0.0, 9.0, 0.4), target)  # behind
+    assert not may_hide(square(4.0, 4.0, 0.4), target)  # beside
+    assert not may_hide(square(0.0, -4.0, 0.4), target)  # at the radar's back
+    rng = np.random.default_rng(2)
+    for _ in range(300):
+        boxes = [square(*rng.uniform(-6, 6, 2), rng.uniform(0.2, 1.5), rng.uniform(0, 6)) for _ in range(2)]
+        blocked = any(crosses(boxes[0], point) for point in interior(boxes[1], rng))
+        assert may_hide(*boxes) or not blocked
+
+
+def interior(corners: Float64, rng: np.random.Generator) -> Float64:
+    """Random points of a rectangle, float64 [40, 2]."""
+    a, b = rng.random((2, 40, 1))
+    return np.asarray(corners[0] + a * (corners[1] - corners[0]) + b * (corners[3] - corners[0]))
+
+
+def crosses(corners: Float64, point: Float64) -> bool:
+    """Whether the way from the eye at the origin to a point meets a rectangle."""
+    t = np.linspace(0.0, 1.0, 200)[:, None] * point - corners[0]
+    u, v = corners[1] - corners[0], corners[3] - corners[0]
+    a, b = t @ u / (u @ u), t @ v / (v @ v)
+    return bool(((a > 0) & (a < 1) & (b > 0) & (b < 1)).any())

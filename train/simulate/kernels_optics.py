@@ -57,15 +57,22 @@ def triangle_integral(qx: float, qy: float, qz: float, shape: Float32) -> comple
     second, third = first + a, first + b
     if plane * area < SERIES_BELOW:
         return complex(area * (1.0 - (first * first + second * second + third * third) / 24.0), 0.0)
-    # Sides i -> j in the sense of the normal: weight q . (l x n), phase at the middle, half the phase along it.
+    # Sides i -> j in the sense of the normal, weight q . (l x n); the corners' phases add up to nothing.
     g_first = ux * tx + uy * ty + uz * tz
     g_third = -(vx * tx + vy * ty + vz * tz)
-    g_second = -(g_first + g_third)
-    s1, s2, s3 = g_first * _sinc(0.5 * a), g_second * _sinc(0.5 * (b - a)), g_third * _sinc(0.5 * b)
-    p1, p2, p3 = 0.5 * (first + second), 0.5 * (second + third), 0.5 * (third + first)
-    real = s1 * math.cos(p1) + s2 * math.cos(p2) + s3 * math.cos(p3)
-    imaginary = s1 * math.sin(p1) + s2 * math.sin(p2) + s3 * math.sin(p3)
-    return complex(imaginary / plane, -real / plane)
+    e_first, e_second = complex(math.cos(first), math.sin(first)), complex(math.cos(second), math.sin(second))
+    e_third = (e_first * e_second).conjugate()
+    total = g_first * _side(e_first, e_second, a) - (g_first + g_third) * _side(e_second, e_third, b - a)
+    total += g_third * _side(e_third, e_first, -b)
+    return complex(total.imag / plane, -total.real / plane)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _side(start: complex, end: complex, turn: float) -> complex:  # pragma: no cover - compiled
+    """Mean of exp(j phase) along a side on which the phase grows by ``turn``, from its values at both ends."""
+    if abs(turn) < 1e-4:
+        return start * complex(1.0 - turn * turn / 6.0, 0.5 * turn)
+    return complex((end.imag - start.imag) / turn, (start.real - end.real) / turn)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -118,6 +125,61 @@ def lobe_candidates(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _lobe(
+    shape: Float32, area: float, spread: float, eye: Float64, z_tx: float, z_rx: float, k: float, limits: Float64
+) -> tuple[float, float, bool, float, float, float, float]:  # pragma: no cover - compiled
+    """What one patch can send at most, and towards where.
+
+    Returns:
+        Size of its integral without the flat lobe (0: nothing), m^2; |cos| of the incidence; whether it is curved;
+        q, rad/m; 1 / (R_t R_r).
+    """
+    dx, dy = eye[0] - shape[0, 0], eye[1] - shape[0, 1]
+    za, zb = z_tx - shape[0, 2], z_rx - shape[0, 2]
+    flat = dx * dx + dy * dy
+    ra, rb = 1.0 / math.sqrt(flat + za * za), 1.0 / math.sqrt(flat + zb * zb)
+    nx, ny, nz = np.float64(shape[1, 0]), np.float64(shape[1, 1]), np.float64(shape[1, 2])
+    side = nx * dx + ny * dy
+    ca, cb = (side + nz * za) * ra, (side + nz * zb) * rb
+    qx, qy, qz = -k * dx * (ra + rb), -k * dy * (ra + rb), -k * (za * ra + zb * rb)
+    incidence = 0.5 * abs(ca + cb)
+    if ca * cb <= 0.0:
+        return 0.0, incidence, False, qx, qy, qz, ra * rb
+    whole, normal = qx * qx + qy * qy + qz * qz, k * (ca + cb)
+    plane = max(whole - normal * normal, 0.0)
+    away, size = plane / (whole * limits[1]), area
+    lobe = LOBE * (2.0 * math.pi / k) ** 2 / area
+    curved = spread > CURVED_FROM * lobe
+    if curved:
+        exponent = plane / (normal * normal) / (4.0 * (lobe + spread))
+        if exponent > MOST_EXPONENT:
+            return 0.0, incidence, True, qx, qy, qz, ra * rb
+        size *= math.sqrt(lobe / (lobe + spread)) * math.exp(-exponent)
+    else:
+        away = max(away, plane * area / limits[0])
+    return size * _fade(away) if away < 1.0 else 0.0, incidence, curved, qx, qy, qz, ra * rb
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _patch_weight(
+    p: int,
+    shape: Float32,
+    area: Float32,
+    spread: Float32,
+    reflection: Float32,
+    roughness: Float32,
+    legs: tuple[Float64, float, float, float, Float64],
+) -> tuple[complex, float]:  # pragma: no cover - compiled
+    """sqrt(sigma) exp(j phase) of one patch, m, and 1 / (R_t R_r); ``legs``: eye, z of both ends, k, limits."""
+    eye, z_tx, z_rx, k, limits = legs
+    size, incidence, curved, qx, qy, qz, spreading = _lobe(shape[p], area[p], spread[p], eye, z_tx, z_rx, k, limits)
+    scale = k / math.sqrt(math.pi) * incidence * reflection[p] * math.exp(-roughness[p] * incidence * incidence)
+    if curved:
+        return complex(scale * size, 0.0), spreading
+    return triangle_integral(qx, qy, qz, shape[p]) * (scale * size / area[p]), spreading
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def patch_weights(
     candidate: Int32,
     shape: Float32,
@@ -131,6 +193,7 @@ def patch_weights(
     wavelength: float,
     limits: Float64,
     keep: float,
+    bound: Float32,
     index: Int32,
     weight: Complex64,
     level: Float32,
@@ -149,62 +212,38 @@ def patch_weights(
         wavelength: metres.
         limits: float64 [2], q_t^2 A beyond which a flat patch and sin^2 of the angle off its normal beyond which any
             patch sends nothing; it fades from half of it on.
-        keep: share of the greatest |level|^2 so far below which an entry is not written.
+        keep: share of the greatest |level|^2 below which an entry need not be written.
+        bound: float32 [c], scratch.
         index, weight, level: out: patch, sqrt(sigma) exp(j phase) in m, and |weight| / (R_t R_r).
     """
     k = 2.0 * math.pi / wavelength
-    front = math.sqrt(4.0 * math.pi) / wavelength
     need = SEEN if path == DIRECT else SEEN_IN_GROUND if path == GROUND else SEEN | SEEN_IN_GROUND
     z_tx, z_rx = eye[3] if path == GROUND else eye[2], eye[2] if path == DIRECT else eye[3]
-    count, strongest = 0, 0.0
+    legs = (eye, z_tx, z_rx, k, limits)
+    best, most = -1, 0.0
     for i in range(len(candidate)):
-        if seen[i] & need != need:
+        bound[i] = 0.0
+        if seen[i] & need == need:
+            p = candidate[i]
+            size, incidence, _, _, _, _, spreading = _lobe(shape[p], area[p], spread[p], eye, z_tx, z_rx, k, limits)
+            bound[i] = k / math.sqrt(math.pi) * incidence * size * reflection[p] * spreading
+            if bound[i] > most:
+                best, most = i, bound[i]
+    if best < 0:
+        return 0
+    # The patch that may be the strongest comes first: most of the others then need no integral.
+    value, spreading = _patch_weight(candidate[best], shape, area, spread, reflection, roughness, legs)
+    strongest, count = abs(value) * spreading, 0
+    share = math.sqrt(keep)
+    for i in range(len(candidate)):
+        if bound[i] < share * strongest or bound[i] == 0.0:
             continue
-        p = candidate[i]
-        dx, dy = eye[0] - shape[p, 0, 0], eye[1] - shape[p, 0, 1]
-        za, zb = z_tx - shape[p, 0, 2], z_rx - shape[p, 0, 2]
-        flat = dx * dx + dy * dy
-        ra2, rb2 = flat + za * za, flat + zb * zb
-        ra, rb = 1.0 / math.sqrt(ra2), 1.0 / math.sqrt(rb2)
-        nx, ny, nz = np.float64(shape[p, 1, 0]), np.float64(shape[p, 1, 1]), np.float64(shape[p, 1, 2])
-        side = nx * dx + ny * dy
-        ca, cb = (side + nz * za) * ra, (side + nz * zb) * rb
-        if ca * cb <= 0.0:
+        value, spreading = _patch_weight(candidate[i], shape, area, spread, reflection, roughness, legs)
+        received = abs(value) * spreading
+        if received < share * strongest or received == 0.0:
             continue
-        qx, qy, qz = -k * dx * (ra + rb), -k * dy * (ra + rb), -k * (za * ra + zb * rb)
-        normal = k * (ca + cb)
-        whole = qx * qx + qy * qy + qz * qz
-        plane = max(whole - normal * normal, 0.0)
-        away = plane / (whole * limits[1])
-        incidence = 0.5 * abs(ca + cb)
-        lobe = LOBE * wavelength * wavelength / area[p]
-        scale = front * incidence * reflection[p] * math.exp(-roughness[p] * incidence * incidence)
-        curved = spread[p] > CURVED_FROM * lobe
-        if not curved:
-            away = max(away, plane * area[p] / limits[0])
-        if away >= 1.0:
-            continue
-        if curved:
-            wide = lobe + spread[p]
-            exponent = plane / (normal * normal) / (4.0 * wide)
-            if exponent > MOST_EXPONENT:
-                continue
-            size = area[p] * math.sqrt(lobe / wide) * math.exp(-exponent)
-        else:
-            size = np.float64(area[p])
-        size *= _fade(away)
-        bound = scale * size * ra * rb
-        if bound * bound < keep * strongest:
-            continue
-        if curved:
-            value = complex(scale * size, 0.0)
-        else:
-            value = triangle_integral(qx, qy, qz, shape[p]) * (scale * size / area[p])
-        power = (value.real * value.real + value.imag * value.imag) / (ra2 * rb2)
-        if power < keep * strongest or power == 0.0:
-            continue
-        strongest = max(strongest, power)
-        index[count], weight[count], level[count] = p, value, math.sqrt(power)
+        strongest = max(strongest, received)
+        index[count], weight[count], level[count] = candidate[i], value, received
         count += 1
     return count
 

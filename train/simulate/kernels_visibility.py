@@ -145,3 +145,35 @@ def test_points(
         between = (1.0 - fv) * ((1.0 - fu) * a + fu * b) + fv * ((1.0 - fu) * c + fu * d)
         if (ahead - bias) * between > 1.0:
             seen[i] &= np.uint8(255 - bit)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def may_hide(other: Float64, own: Float64) -> bool:  # pragma: no cover - compiled
+    """Whether one rectangle on the ground plan can stand between the eye and another one.
+
+    It cannot where a line through the eye has them on its two sides, or where a side of either has the other one beyond
+    it while the eye and the first one are on its near side.
+
+    Args:
+        other, own: float64 [4, 2], corners in order, relative to the eye.
+    """
+    for pair in range(2):
+        corners = other if pair == 0 else own
+        for i in range(4):
+            x, y = corners[i, 0], corners[i, 1]
+            least_own, most_own, least_other, most_other = np.inf, -np.inf, np.inf, -np.inf
+            for j in range(4):
+                a, b = x * own[j, 1] - y * own[j, 0], x * other[j, 1] - y * other[j, 0]
+                least_own, most_own = min(least_own, a), max(most_own, a)
+                least_other, most_other = min(least_other, b), max(most_other, b)
+            if most_own <= 0.0 <= least_other or most_other <= 0.0 <= least_own:
+                return False
+            nx, ny = corners[(i + 1) % 4, 1] - y, x - corners[(i + 1) % 4, 0]
+            for sign in (1.0, -1.0):
+                most_own, least_other = 0.0, np.inf
+                for j in range(4):
+                    most_own = max(most_own, sign * (nx * own[j, 0] + ny * own[j, 1]))
+                    least_other = min(least_other, sign * (nx * other[j, 0] + ny * other[j, 1]))
+                if least_other >= most_own:
+                    return False
+    return True

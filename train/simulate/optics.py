@@ -13,17 +13,18 @@ from edge.frames import RADARS, Float64, RadarId
 from train.simulate.clutter import GroundClutter
 from train.simulate.ground import GroundSettings as GroundSettings
 from train.simulate.kernels_emission import emit
-from train.simulate.kernels_optics import DIRECT, MIXED, UInt8
+from train.simulate.kernels_optics import DIRECT, MIXED, SEEN
 from train.simulate.link_budget import LinkSettings, amplitude_per_rcs
 from train.simulate.optics_settings import OpticsSettings as OpticsSettings
 from train.simulate.scatterers import GroundPlane, Scatterers
 from train.simulate.surface import Placed as Placed
-from train.simulate.visibility import SceneVisibility, View
+from train.simulate.visibility import SceneVisibility, Sight, View
 from train.simulate.weights import Entries, Weigher, join, strongest
 
 REACH_MARGIN_M = 0.3
 """Between the longest half path from the rig's origin and that from any antenna during the burst."""
 CLUTTER_IMBALANCE_DB = 2.0
+_BLIND = Sight(np.empty(0, np.int32), np.empty(0, np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
 
 
 class SceneOptics:
@@ -55,13 +56,15 @@ class SceneOptics:
         self._lsb_per_m = amplitude_per_rcs(link, wavelength_m, noise_lsb)
         self._least_lsb = noise_lsb * 10 ** (settings.floor_db / 20)
         self._clutter = GroundClutter(settings.ground, CLUTTER_IMBALANCE_DB, rng)
-        self._clutter_seen: UInt8 = np.zeros(len(self._clutter.weight), np.uint8)
         surfaces = [one.surface for one in self._placed]
         self._visibility = SceneVisibility(surfaces, *settings.picture)
         self._weigher = Weigher(surfaces, settings, wavelength_m)
-        self._seen_from: bytes = b""
-        self._weighed_from: bytes = b""
-        self._entries = self._gather([], np.zeros(3))
+        self._looked_from, self._clutter_from = b"", b""
+        self._seen_from = [b""] * len(surfaces)
+        self._weighed_from = [b""] * len(surfaces)
+        self._sights: list[Sight] = [_BLIND] * len(surfaces)
+        self._weighed: list[Entries] = [join([])] * len(surfaces)
+        self._entries, self._clutter_origin_m = join([]), np.zeros(3)
 
     def scatterers(
         self,
@@ -127,39 +130,56 @@ class SceneOptics:
         return views
 
     def _refresh(self, now: Sequence[Placed], position_m: Float64) -> None:
-        """Visibility and amplitudes of the grid's points that belong to this place."""
-        settings = self._settings
-        origin = np.append(settings.visibility_step_m * np.rint(position_m[:2] / settings.visibility_step_m), 0.0)
-        views = self._views(now, position_m, settings.visibility_step_m)
-        key = np.concatenate([origin, *(view.eye_m for view in views), position_m[2:]]).tobytes()
-        if key != self._seen_from:
-            around = self._clutter.around(np.append(origin[:2], position_m[2]))
-            step_m = settings.visibility_step_m
-            near = [self._weigher.candidates(n, view.in_object_m, step_m) for n, view in enumerate(views)]
-            self._visibility.update(views, settings.ground.enabled, near, around, self._clutter_seen)
-            self._seen_from, self._weighed_from = key, b""
-        views = self._views(now, position_m, settings.weight_step_m)
-        key = np.concatenate([position_m[2:], *(view.eye_m for view in views)]).tobytes()
-        if key != self._weighed_from:
-            self._entries = self._gather(views, np.append(origin[:2], position_m[2]))
-            self._weighed_from = key
+        """Visibility and amplitudes of the grid's points that belong to this place, of the objects that need it."""
+        step_m = self._settings.visibility_step_m
+        origin = np.append(step_m * np.rint(position_m[:2] / step_m), position_m[2])
+        views = self._views(now, position_m, step_m)
+        changed = self._look(views, origin)
+        near = self._views(now, position_m, self._settings.weight_step_m)
+        for number, view in enumerate(near):
+            eye = view.in_object_m
+            if number in changed or eye.tobytes() != self._weighed_from[number]:
+                self._weighed[number] = self._weigher.weigh(number, eye, self._sights[number])
+                self._weighed_from[number] = eye.tobytes()
+                changed.add(number)
+        if changed or origin.tobytes() != self._clutter_from:
+            self._entries = self._gather(origin)
+            self._clutter_origin_m, self._clutter_from = origin, origin.tobytes()
 
-    def _gather(self, views: Sequence[View], origin_m: Float64) -> Entries:
-        """Amplitudes of all objects, the strongest kept, and the visible clutter."""
+    def _look(self, views: Sequence[View], origin_m: Float64) -> set[int]:
+        """Make new pictures where an object, or one that may hide it, or the ground's points have moved."""
+        whole = b"".join([origin_m.tobytes(), *(view.eye_m.tobytes() for view in views)])
+        if whole == self._looked_from:
+            return set()
+        self._looked_from = whole
+        changed, around = set(), self._clutter.around(origin_m)
+        for number, view in enumerate(views):
+            hiders = self._visibility.hiders(number, views)
+            key = b"".join(
+                [origin_m.tobytes(), *(views[n].eye_m.tobytes() + bytes([n % 256]) for n in (number, *hiders))]
+            )
+            if key == self._seen_from[number]:
+                continue
+            candidates = self._weigher.candidates(number, view.in_object_m, self._settings.visibility_step_m)
+            ground = self._settings.ground.enabled
+            self._sights[number] = self._visibility.look(number, views, hiders, ground, candidates, around)
+            self._seen_from[number] = key
+            changed.add(number)
+        return changed
+
+    def _gather(self, origin_m: Float64) -> Entries:
+        """The strongest amplitudes of all objects, and the visible clutter."""
         least = self._least_lsb / self._lsb_per_m
-        sight = self._visibility
-        found = [
-            self._weigher.weigh(n, view.in_object_m, sight.candidates[n], sight.patches[n], sight.points[n])
-            for n, view in enumerate(views)
-        ]
-        objects = strongest(join(found), self._settings.max_scatterers, least)
-        self._clutter_origin_m = origin_m
-        seen = self._clutter_seen > 0
-        count = int(np.count_nonzero(seen))
+        objects = strongest(join(self._weighed), self._settings.max_scatterers, least)
+        seen = np.full(len(self._clutter.weight), SEEN, np.uint8)
+        for sight in self._sights:
+            seen &= sight.clutter
+        kept = seen > 0
+        count = int(np.count_nonzero(kept))
         clutter = Entries(
-            self._clutter.around(origin_m)[seen],
-            self._clutter.weight[seen],
-            np.ascontiguousarray(self._clutter.board[seen].T),
+            self._clutter.around(origin_m)[kept],
+            self._clutter.weight[kept],
+            np.ascontiguousarray(self._clutter.board[kept].T),
             np.full(count, DIRECT, np.uint8),
             np.full(count, len(self._placed), np.int32),
             np.zeros(count, np.float32),

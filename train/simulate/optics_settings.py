@@ -29,7 +29,7 @@ class OpticsSettings:
     weight_step_m: float = 0.04
     picture: tuple[int, int] = (320, 160)
     keep_db: float = 30.0
-    floor_db: float = -50.0
+    floor_db: float = -40.0
     max_scatterers: int = 3000
     lobe_end: float = 20.0
     lobe_most_deg: float = 25.0

@@ -22,7 +22,7 @@ from train.simulate.ground import GroundSettings
 from train.simulate.kernels_optics import SEEN
 from train.simulate.optics_settings import OpticsSettings
 from train.simulate.surface import Surface, SurfaceSettings, make_surface
-from train.simulate.visibility import SceneVisibility, View
+from train.simulate.visibility import SceneVisibility, Sight, View
 from train.simulate.weights import Entries, Weigher
 
 WAVELENGTH_M = 0.003807
@@ -59,14 +59,12 @@ class CrossSection:
         """Scattering amplitudes towards a radar at ``eye_m`` [3], frame of the object."""
         eye = np.append(np.asarray(eye_m, dtype=np.float64), -eye_m[2])
         candidates = self._weigher.candidates(0, eye, 0.0)
-        if self._visibility is None:
-            patches = np.full(len(candidates), SEEN, np.uint8)
-            points = np.full(len(self._surface.points), SEEN, np.uint8)
-        else:
+        none, every = np.empty((0, 3), np.float32), np.full(len(candidates), SEEN, np.uint8)
+        sight = Sight(candidates, every, np.full(len(self._surface.points), SEEN, np.uint8), every[:0])
+        if self._visibility is not None:
             view = View(eye[:3], float(eye[3]), np.eye(3))
-            self._visibility.update([view], False, [candidates], np.empty((0, 3), np.float32), np.empty(0, np.uint8))
-            patches, points = self._visibility.patches[0], self._visibility.points[0]
-        return self._weigher.weigh(0, eye, candidates, patches, points)
+            sight = self._visibility.look(0, [view], [], False, candidates, none)
+        return self._weigher.weigh(0, eye, sight)
 
     def amplitude(self, eye_m: Float64, reference_m: Float64) -> complex:
         """Root of the cross-section with its phase, as a point at ``reference_m`` [3] would show it, m."""

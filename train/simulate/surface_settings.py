@@ -33,7 +33,7 @@ class SurfaceSettings:
     max_patches: int = 250_000
     crease_deg: float = 40.0
     phong: float = 0.5
-    diffuse_points: int = 512
+    diffuse_points: int = 256
     edge_m: float = 0.05
     edge_points: int = 1500
     reflection_db: float = 0.0

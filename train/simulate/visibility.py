@@ -36,13 +36,35 @@ class View:
     rotation: Float64
 
     @property
+    def image_m(self) -> Float64:
+        """The radar's image as ``eye_m``."""
+        return np.array([self.eye_m[0], self.eye_m[1], self.image_z_m])
+
+    @property
     def in_object_m(self) -> Float64:
         """The radar in the object's frame and the z of its image, float64 [4]; objects stand upright."""
         return np.append(self.rotation.T @ self.eye_m, self.image_z_m)
 
 
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What is seen of one object.
+
+    Args:
+        candidates: int32 [c], numbers of the patches that were looked at and are seen.
+        patches: uint8 [c], bits SEEN and SEEN_IN_GROUND of those.
+        points: uint8 [m], the same of all its points.
+        clutter: uint8 [g], SEEN where it does not hide a ground point.
+    """
+
+    candidates: Int32
+    patches: UInt8
+    points: UInt8
+    clutter: UInt8
+
+
 class SceneVisibility:
-    """Visibility of every patch, point and ground point; owns the pictures.
+    """Visibility of patches, points and ground points; owns the picture.
 
     Args:
         surfaces: the objects.
@@ -53,91 +75,91 @@ class SceneVisibility:
         self._surfaces = tuple(surfaces)
         self._camera = [np.empty_like(surface.vertices) for surface in surfaces]
         self._inverse = np.empty((rows, columns), np.float32)
-        self._every_point = [np.arange(len(surface.points), dtype=np.int32) for surface in surfaces]
-        self.candidates: list[Int32] = [np.empty(0, np.int32) for _ in surfaces]
-        """Patches of every object that were looked at."""
-        self.patches: list[UInt8] = [np.empty(0, np.uint8) for _ in surfaces]
-        """Bits SEEN and SEEN_IN_GROUND of those."""
-        self.points: list[UInt8] = [np.empty(len(surface.points), np.uint8) for surface in surfaces]
-        """The same of all points."""
 
-    def update(
-        self,
-        views: Sequence[View],
-        ground: bool,
-        candidates: list[Int32],
-        clutter_m: Float32,
-        clutter_seen: UInt8,
-    ) -> None:
-        """Visibility from one place.
+    def hiders(self, number: int, views: Sequence[View]) -> list[int]:
+        """Numbers of the other objects that may hide part of object ``number``, by their boxes on the ground plan."""
+        own = self._corners(number, views[number])
+        others = [other for other in range(len(views)) if other != number]
+        return [other for other in others if kernels.may_hide(self._corners(other, views[other]), own)]
 
-        Args:
-            views: of the objects, in their order.
-            ground: also from the image below the ground.
-            candidates: numbers of the patches of every object that are looked at.
-            clutter_m: float32 [c, 3], ground points in world axes from the radar.
-            clutter_seen: uint8 [c], out: SEEN or 0.
-        """
-        clutter_seen[:] = SEEN
-        self.candidates = candidates
-        self.patches = [np.zeros(len(index), np.uint8) for index in candidates]
-        for seen in self.points:
-            seen[:] = 0
-        for mirrored in (False, True) if ground else (False,):
-            bit = SEEN_IN_GROUND if mirrored else SEEN
-            eyes = [np.append(view.eye_m[:2], view.image_z_m) if mirrored else view.eye_m for view in views]
-            for number in range(len(views)):
-                if mirrored:
-                    self._one(number, views, eyes, bit, clutter_m[:0], clutter_seen[:0])
-                else:
-                    self._one(number, views, eyes, bit, clutter_m, clutter_seen)
+    def _corners(self, number: int, view: View) -> Float64:
+        """Corners of an object's box on the ground plan relative to the eye, world axes, float64 [4, 2]."""
+        low, high = self._surfaces[number].low_m, self._surfaces[number].high_m
+        box = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+        return np.ascontiguousarray(box @ view.rotation[:2, :2].T - view.eye_m[:2])
 
-    def _one(
+    def look(
         self,
         number: int,
         views: Sequence[View],
-        eyes: Sequence[Float64],
-        bit: int,
+        hiders: Sequence[int],
+        ground: bool,
+        candidates: Int32,
         clutter_m: Float32,
-        clutter_seen: UInt8,
-    ) -> None:
-        """Picture of one object with all that hides it, and what it shows."""
+    ) -> Sight:
+        """Visibility of one object.
+
+        Args:
+            number: of the object.
+            views: of all objects, in their order.
+            hiders: numbers of those that may hide it.
+            ground: also from the image below the ground.
+            candidates: int32 [c], numbers of the patches that are looked at.
+            clutter_m: float32 [g, 3], ground points in world axes from the radar.
+        """
         surface = self._surfaces[number]
-        self.patches[number] |= np.uint8(bit)
-        self.points[number] |= np.uint8(bit)
+        patches, points = np.zeros(len(candidates), np.uint8), np.zeros(len(surface.points), np.uint8)
+        clutter = np.full(len(clutter_m), SEEN, np.uint8)
+        for bit in (SEEN, SEEN_IN_GROUND) if ground else (SEEN,):
+            patches |= np.uint8(bit)
+            points |= np.uint8(bit)
+            picture = self._picture(number, views, hiders, bit)
+            if picture is None:
+                continue
+            axes, turned, eye, pinhole = picture
+            for place, index, bias_m, seen in (
+                (surface.patches.flat, candidates, PATCH_BIAS_M, patches),
+                (surface.points.position, np.arange(len(points), dtype=np.int32), POINT_BIAS_M, points),
+            ):
+                kernels.test_points(place, index, turned, eye, *pinhole, self._inverse, bias_m, bit, seen)
+            if bit == SEEN:
+                every, origin = np.arange(len(clutter_m), dtype=np.int32), np.zeros(3)
+                kernels.test_points(
+                    clutter_m, every, axes, origin, *pinhole, self._inverse, CLUTTER_BIAS_M, bit, clutter
+                )
+        kept = patches > 0
+        return Sight(candidates[kept], patches[kept], points, clutter)
+
+    def _picture(
+        self, number: int, views: Sequence[View], hiders: Sequence[int], bit: int
+    ) -> tuple[Float64, Float64, Float64, tuple[float, float, float]] | None:
+        """Draw one object and all that hides it; camera axes in the world and in its frame, eye there, pinhole."""
+        surface, mirrored = self._surfaces[number], bit == SEEN_IN_GROUND
+        eyes = {n: views[n].image_m if mirrored else views[n].eye_m for n in (number, *hiders)}
         middle = views[number].rotation @ (0.5 * (surface.low_m + surface.high_m)) - eyes[number]
         if np.linalg.norm(middle[:2]) < 1e-6:
-            return
+            return None
         axes = _look(middle)
         window = np.array([np.inf, np.inf, -np.inf, -np.inf])
         turned, eye = self._project(number, views[number].rotation, eyes[number], axes, window)
         if not window[0] < window[2] or not window[1] < window[3]:
-            return
+            return None
         rows, columns = self._inverse.shape
         focal = float(min((columns - 3) / (window[2] - window[0]), (rows - 3) / (window[3] - window[1])))
-        column = 0.5 * (columns - 1) - 0.5 * focal * (window[0] + window[2])
-        row = 0.5 * (rows - 1) - 0.5 * focal * (window[1] + window[3])
+        column = float(0.5 * (columns - 1) - 0.5 * focal * (window[0] + window[2]))
+        row = float(0.5 * (rows - 1) - 0.5 * focal * (window[1] + window[3]))
         self._inverse[:] = 0.0
         kernels.rasterize(self._camera[number], surface.faces, focal, column, row, self._inverse)
-        for other in range(len(views)):
-            if other == number or not self._may_hide(other, number, views, eyes, middle):
-                continue
+        for other in hiders:
             ways = [(eyes[other], axes)]
-            if bit == SEEN_IN_GROUND:
+            if mirrored:
                 # On its way down to the ground the wave meets other objects; in the image's space, their images. What
                 # an object's own image hides of it is next to nothing.
                 ways.append((views[other].eye_m, axes * (1.0, 1.0, -1.0)))
-            for eye_m, mirrored in ways:
-                self._project(other, views[other].rotation, eye_m, mirrored, np.zeros(4))
+            for eye_m, camera_axes in ways:
+                self._project(other, views[other].rotation, eye_m, camera_axes, np.zeros(4))
                 kernels.rasterize(self._camera[other], self._surfaces[other].faces, focal, column, row, self._inverse)
-        picture = (focal, column, row, self._inverse)
-        for points, index, bias_m, seen in (
-            (surface.patches.flat, self.candidates[number], PATCH_BIAS_M, self.patches[number]),
-            (surface.points.position, self._every_point[number], POINT_BIAS_M, self.points[number]),
-        ):
-            kernels.test_points(points, index, turned, eye, *picture, bias_m, bit, seen)
-        every = np.arange(len(clutter_m), dtype=np.int32)
-        kernels.test_points(clutter_m, every, axes, np.zeros(3), *picture, CLUTTER_BIAS_M, bit, clutter_seen)
+        return axes, turned, eye, (focal, column, row)
 
     def _project(
         self, number: int, rotation: Float64, eye_m: Float64, axes: Float64, window: Float64
@@ -146,25 +168,6 @@ class SceneVisibility:
         turned, eye = np.ascontiguousarray(axes @ rotation), rotation.T @ eye_m
         kernels.to_camera(self._surfaces[number].vertices, turned, eye, self._camera[number], window)
         return turned, eye
-
-    def _may_hide(
-        self, other: int, number: int, views: Sequence[View], eyes: Sequence[Float64], middle: Float64
-    ) -> bool:
-        """Whether the spheres around two objects overlap as seen from the eye, and the other one is not behind."""
-        radius, distance = self._radius(number), float(np.linalg.norm(middle))
-        surface = self._surfaces[other]
-        towards = views[other].rotation @ (0.5 * (surface.low_m + surface.high_m)) - eyes[other]
-        other_radius, other_distance = self._radius(other), float(np.linalg.norm(towards))
-        if other_distance - other_radius > distance + radius:
-            return False
-        if distance <= radius or other_distance <= other_radius:
-            return True
-        between = np.arccos(np.clip(middle @ towards / (distance * other_distance), -1.0, 1.0))
-        return bool(between < np.arcsin(radius / distance) + np.arcsin(other_radius / other_distance))
-
-    def _radius(self, number: int) -> float:
-        surface = self._surfaces[number]
-        return 0.5 * float(np.linalg.norm(surface.high_m - surface.low_m))
 
 
 def _look(towards: Float64) -> Float64:

@@ -26,6 +26,7 @@ from train.simulate.kernels_optics import (
 from train.simulate.optics_settings import OpticsSettings
 from train.simulate.points import Patches
 from train.simulate.surface import Surface
+from train.simulate.visibility import Sight
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +113,7 @@ class Weigher:
         self._paths = (DIRECT, MIXED, GROUND) if settings.ground.enabled else (DIRECT,)
         most = max([len(one.patches) + len(one.points) for one in surfaces], default=0)
         self._index, self._level = np.empty(most, np.int32), np.empty(most, np.float32)
+        self._bound = np.empty(most, np.float32)
         self._weight, self._mark = np.empty(most, np.complex64), np.empty(most, np.uint8)
         most_sine = float(np.sin(np.radians(settings.lobe_most_deg)))
         self._limits = np.array([settings.lobe_end**2, most_sine**2])
@@ -138,14 +140,13 @@ class Weigher:
         count = lobe_candidates(facing, eye_m, slack_rad, self._mark[: facing.shape[1]], self._index)
         return self._index[:count].copy()
 
-    def weigh(self, number: int, eye_m: Float64, candidates: Int32, patches_seen: UInt8, points_seen: UInt8) -> Entries:
+    def weigh(self, number: int, eye_m: Float64, sight: Sight) -> Entries:
         """Entries of one object within ``keep_db`` of its strongest.
 
         Args:
             number: of the object.
             eye_m: float64 [4], the radar in the object's frame and the z of its image.
-            candidates, patches_seen: int32 [c], uint8 [c], patches that may matter and bits of their visibility.
-            points_seen: uint8, bits of all points.
+            sight: what is seen of it.
         """
         surface, keep = self._surfaces[number], 10 ** (-self._settings.keep_db / 10)
         p, q = surface.patches, surface.points
@@ -153,12 +154,12 @@ class Weigher:
         for path in self._paths:
             mirror = self._mirror(eye_m, 0.5 * (surface.low_m + surface.high_m)) ** path
             count = patch_weights(
-                *(candidates, p.shape, p.area, p.spread, p.reflection, p.roughness, patches_seen, eye_m, path),
-                *(self._wavelength_m, self._limits, keep, self._index, self._weight, self._level),
+                *(sight.candidates, p.shape, p.area, p.spread, p.reflection, p.roughness, sight.patches, eye_m, path),
+                *(self._wavelength_m, self._limits, keep, self._bound, self._index, self._weight, self._level),
             )
             found.append(self._entries(number, path, mirror, count, p.shape[:, 0], p.board))
             count = point_weights(
-                *(q.position, q.axis, q.kind, q.amplitude, q.length, points_seen, eye_m, path, self._wavelength_m),
+                *(q.position, q.axis, q.kind, q.amplitude, q.length, sight.points, eye_m, path, self._wavelength_m),
                 *(self._index, self._weight, self._level),
             )
             found.append(self._entries(number, path, mirror, count, q.position, q.board))
