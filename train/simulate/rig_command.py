@@ -19,6 +19,7 @@ from edge.errors import ConfigError, ExitCode
 if TYPE_CHECKING:
     from edge.frames import Pose
     from edge.rig import Rig
+    from train.simulate.faults import Faults
     from train.simulate.rig import VirtualRig, VirtualRigSettings
     from train.simulate.supplies import FrameSupply
 
@@ -33,7 +34,7 @@ def add_verb(verbs: Any) -> None:
     )
     verb.add_argument("name", help="rig: name or folder, for example cascade_pair or awr1843_pair")
     verb.add_argument("--object", metavar="REF", help="drive past this object, for example car/parametric_00012")
-    verb.add_argument("--frames", type=int, default=8, help="without an object: different frames of point targets")
+    verb.add_argument("--frames", type=int, help="make this many frames first and repeat them (point targets: 8)")
     verb.add_argument("--seed", type=int, default=0, help="of scene and faults")
     verb.add_argument("--pace", type=float, default=1.0, help="1: real time, 2: twice as fast, 0: as fast as it goes")
     verb.add_argument("--root", type=Path, help="folder of the capture boards' disks (default: a temporary one)")
@@ -43,6 +44,7 @@ def add_verb(verbs: Any) -> None:
     verb.add_argument("--quick", action="store_true", help="no delays of boards at configuration and start")
     verb.add_argument("--fault", action="append", default=[], metavar="RULE", help="'drop vertical/data share=0.01'")
     verb.add_argument("--seconds", type=float, help="end after this time instead of at Ctrl-C")
+    verb.add_argument("--source", action="store_true", help="no boards: read the simulator source, say if it kept up")
     verb.set_defaults(run=run)
 
 
@@ -52,12 +54,14 @@ def run(options: argparse.Namespace) -> int:
     from train.simulate.rig import VirtualRig
     from train.simulate.rig_control import set_fault
 
-    if not 0 <= options.pace < 1e6 or options.frames < 1:
+    if not 0 <= options.pace < 1e6 or (options.frames is not None and options.frames < 1):
         raise ConfigError("rig", value=(options.pace, options.frames), allowed="--pace >= 0, --frames >= 1")
     faults = Faults(options.seed)
     for rule in options.fault:
         set_fault(faults, rule.split())
     loaded, supply, poses = _scene(options)
+    if options.source:
+        return _read_source(loaded, supply, poses, options, faults)
     with ExitStack() as stack:
         root = options.root or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rfconstruct-rig-")))
         stop = stack.enter_context(_interrupts())
@@ -71,21 +75,45 @@ def run(options: argparse.Namespace) -> int:
     return int(ExitCode.OK)
 
 
+def _read_source(
+    rig: Rig, supply: FrameSupply, poses: Iterable[Pose], options: argparse.Namespace, faults: Faults
+) -> int:
+    """Read the simulator source at its pace; say how many frames came, how many late, and what it cost."""
+    from edge.frames import RadarFrame
+    from train.simulate.simulator_source import SimulatorSource
+
+    source = SimulatorSource(rig, supply, None, poses, pace=options.pace, faults=faults)
+    frames, start_s, cpu_s = 0, 0.0, 0.0
+    with _interrupts() as stop:
+        for item in source:
+            if not start_s:
+                start_s, cpu_s = time.monotonic(), time.process_time()
+            frames += isinstance(item, RadarFrame)
+            if stop.is_set() or time.monotonic() - start_s >= (options.seconds or float("inf")):
+                break
+    taken_s, cpu_s = time.monotonic() - start_s, time.process_time() - cpu_s
+    source.close()
+    rate_hz, load = frames / taken_s, 100 * cpu_s / taken_s
+    print(f"{frames} frames in {taken_s:.2f} s: {rate_hz:.1f} a second, {load:.0f} % of one core")
+    print(f"late because they were not made in time: {source.late.total()}; asked for late: {source.slow_reads}")
+    return int(ExitCode.DEGRADED if source.late else ExitCode.OK)
+
+
 def _scene(options: argparse.Namespace) -> tuple[Rig, FrameSupply, Iterable[Pose]]:
     """Rig, frames and poses: a drive-by past an object, or point targets again and again."""
     from edge.rig import load_rig
+    from train.simulate.supplies import rendered, straight_poses, targets
 
     if options.object is None:
-        from train.simulate.supplies import straight_poses, targets
-
         rig = load_rig(options.name)
-        return rig, targets(rig, options.frames, options.seed), straight_poses(rig)
+        return rig, targets(rig, options.frames or 8, options.seed), straight_poses(rig)
     from train.objects.reference import ObjectRef
     from train.simulate.cloud import DriveSpec, make_drive
 
     spec = DriveSpec(ObjectRef.from_text(options.object), options.seed, rig=options.name, every=1)
     drive = make_drive(spec, spec.object.mesh())
-    return drive.rig, drive.frame, drive.poses
+    supply = rendered(drive.rig, drive.frame, options.frames) if options.frames else drive.frame
+    return drive.rig, supply, drive.poses
 
 
 def _settings(options: argparse.Namespace) -> VirtualRigSettings:

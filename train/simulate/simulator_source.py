@@ -26,7 +26,8 @@ from train.simulate.pose_stream import WHERE as POSE
 from train.simulate.supplies import FrameSupply
 from train.simulate.threads import join, wait_until
 
-DEPTH = 8
+DEPTH = 32
+"""Items; of cascades with 8 loops 50 MB: a quarter of a second in which the machine may do something else."""
 LATE_SHARE = 0.25
 """Share of the frame period by which a frame or a reader may be behind before it counts as late."""
 _POLL_S = 0.1

@@ -81,6 +81,11 @@ def targets(
     return CyclicSupply(rig, made)
 
 
+def rendered(rig: Rig, supply: FrameSupply, count: int) -> CyclicSupply:
+    """The first ``count`` frames of each radar, made now and repeated; what is kept in memory is all of them."""
+    return CyclicSupply(rig, {radar: [supply(radar, number) for number in range(count)] for radar in rig.radars})
+
+
 def straight_poses(rig: Rig, speed_m_s: float = SPEED_M_S, rate_hz: float = POSE_RATE_HZ) -> Iterator[Pose]:
     """Endless poses of a vehicle that drives along +x from just before the first frame, without error."""
     position_m, attitude = rig_in_vehicle(rig.geometry)
