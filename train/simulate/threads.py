@@ -12,8 +12,6 @@ from typing import Any
 
 JOIN_S = 5.0
 """No thread of the rig needs longer to end; one that does is reported, not waited for."""
-SPIN_S = 0.5e-3
-"""The rest of a wait that is not slept, because sleeping overshoots by about this."""
 
 
 def join(thread: threading.Thread) -> bool:
@@ -69,13 +67,9 @@ class Later:
 
 
 def wait_until(t_s: float, stop: threading.Event) -> bool:
-    """Sleep until the monotonic clock shows ``t_s``, the last half millisecond awake; False: stopped before."""
-    rest_s = t_s - time.monotonic() - SPIN_S
-    if rest_s > 0 and stop.wait(rest_s):
-        return False
-    while time.monotonic() < t_s:
-        time.sleep(0)
-    return not stop.is_set()
+    """Sleep until the monotonic clock shows ``t_s``; False: stopped before."""
+    rest_s = t_s - time.monotonic()
+    return not (stop.wait(rest_s) if rest_s > 0 else stop.is_set())
 
 
 class Bursts:
