@@ -30,7 +30,7 @@ class OpticsSettings:
     picture: tuple[int, int] = (320, 160)
     keep_db: float = 30.0
     floor_db: float = -40.0
-    max_scatterers: int = 3000
+    max_scatterers: int = 1500
     lobe_end: float = 20.0
     lobe_most_deg: float = 25.0
     ground: GroundSettings = field(default_factory=GroundSettings)
