@@ -63,24 +63,19 @@ def test_the_bare_machine_is_where_its_rider_touches_it() -> None:
 
 
 def test_library_two_wheelers_can_be_ridden(object_data: Path) -> None:
-    """Nearly all of them; the rider touches the machine itself with seat and both hands."""
-    refused, checked = [], 0
+    """All of them; saddle and grips are found on the machine itself, and the rider touches them."""
+    checked = 0
     for ref in library_refs(object_data):
         if ref.class_name not in RIDDEN:
             continue
         mesh = ref.mesh(object_data)
-        try:
-            contacts = find_contacts(mesh)
-        except MeshError:
-            refused.append(ref.name)
-            continue
+        contacts = find_contacts(mesh)
         machine = cKDTree(sample_surface(mesh.vertices, mesh.faces, 60_000, np.random.default_rng(1)))
         assert machine.query(np.vstack([contacts.saddle, contacts.grips]))[0].max() < 0.06, ref.name
         checked += 1
-        if checked % 5 == 0:
+        if checked % 6 == 0:
             away = touch_m(own_rider(contacts, np.random.default_rng(0)), contacts)
             assert away[:3].max() < 0.05, (ref.name, away)
-    assert len(refused) <= 4, refused
     assert checked >= 70
 
 

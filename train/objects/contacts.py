@@ -28,19 +28,45 @@ def find_contacts(mesh: Mesh) -> Contacts:
     if name not in ("bicycle", "motorcycle"):
         raise MeshError("only two-wheelers have riders", value=mesh.object_id, allowed="bicycle, motorcycle")
     points = sample_surface(mesh.vertices, mesh.faces, _POINTS, np.random.default_rng(0))
-    pedals = name == "bicycle"
-    saddle = _bicycle_saddle(points, mesh.size_m) if pedals else _motorcycle_seat(points, mesh.size_m)
-    grips = _bicycle_grips(points, saddle) if pedals else _motorcycle_grips(points, saddle)
-    reach = float(np.hypot(grips[0, 0] - saddle[0], grips[0, 2] - saddle[2]))
-    if not (_ARM_M[0] < reach < _ARM_M[1] and -0.25 < grips[0, 2] - saddle[2] < 0.6):
-        raise MeshError(
-            f"{mesh.object_id}: no place for a rider",
-            value=f"grips {reach:.2f} m from the saddle",
-            allowed=f"{_ARM_M[0]}..{_ARM_M[1]} m",
-            action="use it without a rider",
-        )
-    feet = _pedals(points, saddle) if pedals else _pegs(points, saddle, grips)
-    return Contacts(saddle, grips, feet, pedals)
+    pedals, problem = name == "bicycle", None
+    for attempt in (_bicycle, _long_bicycle) if pedals else (_motorcycle, _seat_far_back):
+        try:
+            saddle, grips = attempt(points, float(mesh.size_m[0]))
+        except MeshError as error:
+            problem = problem or error
+            continue
+        reach = float(np.hypot(grips[0, 0] - saddle[0], grips[0, 2] - saddle[2]))
+        if _ARM_M[0] < reach < _ARM_M[1] and -0.25 < grips[0, 2] - saddle[2] < 0.6:
+            feet = _pedals(points, saddle) if pedals else _pegs(points, saddle, grips)
+            return Contacts(saddle, grips, feet, pedals)
+    raise MeshError(
+        f"{mesh.object_id}: no place for a rider",
+        value=problem.what if problem else "grips out of reach of the saddle",
+        allowed=f"a saddle, and grips {_ARM_M[0]}..{_ARM_M[1]} m ahead of it",
+        action="use it without a rider",
+    )
+
+
+def _bicycle(points: Float32, length: float) -> tuple[Float64, Float64]:
+    saddle = _bicycle_saddle(points, -0.30 * length, 0.06 * length)
+    return saddle, _bicycle_grips(points, saddle, -0.25)
+
+
+def _long_bicycle(points: Float32, length: float) -> tuple[Float64, Float64]:
+    """A load stands before the rider, as wide as the bar but lower."""
+    saddle = _bicycle_saddle(points, -0.32 * length, -0.12 * length)
+    return saddle, _bicycle_grips(points, saddle, 0.05)
+
+
+def _motorcycle(points: Float32, length: float) -> tuple[Float64, Float64]:
+    saddle = _motorcycle_seat(points, -0.20 * length, 0.08 * length, -0.08 * length)
+    return saddle, _motorcycle_grips(points, saddle)
+
+
+def _seat_far_back(points: Float32, length: float) -> tuple[Float64, Float64]:
+    """The seat of a scooter is over the rear wheel."""
+    saddle = _motorcycle_seat(points, -0.36 * length, -0.10 * length, -0.22 * length)
+    return saddle, _motorcycle_grips(points, saddle)
 
 
 def _top(points: Float32, low_x: float, high_x: float, half_width: float) -> tuple[Float64, Float64]:
@@ -54,9 +80,9 @@ def _top(points: Float32, low_x: float, high_x: float, half_width: float) -> tup
     return edges + _BIN_M / 2, height
 
 
-def _bicycle_saddle(points: Float32, size: Float32) -> Float64:
-    """The widest part of what stands highest behind the middle."""
-    x, height = _top(points, -0.30 * float(size[0]), 0.06 * float(size[0]), 0.05)
+def _bicycle_saddle(points: Float32, low_x: float, high_x: float) -> Float64:
+    """The widest part of what stands highest in a stretch."""
+    x, height = _top(points, low_x, high_x, 0.05)
     top = float(height.max())
     behind = (points[:, 0] > x[0]) & (points[:, 0] < x[-1])
     cover = points[behind & (points[:, 2] > top - 0.05) & (np.abs(points[:, 1]) < 0.14)]
@@ -69,15 +95,15 @@ def _bicycle_saddle(points: Float32, size: Float32) -> Float64:
     return saddle
 
 
-def _motorcycle_seat(points: Float32, size: Float32) -> Float64:
-    """The lowest level stretch of the side view's upper edge about the middle, between tank and tail."""
-    x, height = _top(points, -0.20 * float(size[0]), 0.08 * float(size[0]), 0.10)
+def _motorcycle_seat(points: Float32, low_x: float, high_x: float, usual_x: float) -> Float64:
+    """The lowest level stretch of the side view's upper edge, between tank and tail."""
+    x, height = _top(points, low_x, high_x, 0.10)
     best, found = np.inf, None
     for k in range(3, len(x) - 3):
         stretch = height[k - 3 : k + 4]
         if stretch.min() < 0.5 or stretch.max() > 1.0:
             continue
-        cost = float(height[k]) + 2 * float(np.ptp(stretch)) + 0.3 * abs(float(x[k]) + 0.08 * float(size[0]))
+        cost = float(height[k]) + 2 * float(np.ptp(stretch)) + 0.3 * abs(float(x[k]) - usual_x)
         if cost < best:
             best, found = cost, np.array([x[k], 0.0, height[k]])
     if found is None:
@@ -94,9 +120,9 @@ def _wide(points: Float32, saddle: Float64, ahead_m: float, above_m: float) -> F
     return upper
 
 
-def _bicycle_grips(points: Float32, saddle: Float64) -> Float64:
+def _bicycle_grips(points: Float32, saddle: Float64, above_m: float) -> Float64:
     """The outer ends of the widest thing ahead of and about as high as the saddle."""
-    upper = _wide(points, saddle, 0.2, -0.25)
+    upper = _wide(points, saddle, 0.2, above_m)
     half = float(np.quantile(np.abs(upper[:, 1]), 0.995))
     return _both_sides(upper[np.abs(upper[:, 1]) > half - 0.035], upper)
 

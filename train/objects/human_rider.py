@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from edge.frames import Float64
-from train.objects.human import WORLD, HumanModel, about_y, align, build, compact
+from train.objects.human import DETAIL_M, WORLD, HumanModel, about_y, align, build, compact
 from train.objects.primitives import Part
 from train.objects.reduce import merge_near
 from train.objects.rider import Contacts, Skeleton, fit_stature, foot_pitch, helmet, limbs, settle, trunk_lean
@@ -18,8 +18,6 @@ _BEND = {"pelvis": 0.5, "spine_01": 0.8, "spine_02": 1.05, "spine_03": 1.2, "nec
 _BEND_NAMES = {bone.split("_")[0] for bone in _BEND}
 _FINGERS = ("index", "middle", "ring", "pinky")
 _CURL_RAD = math.radians(55)
-_DETAIL_M = 0.012
-"""Vertices nearer than this are merged: 27,000 triangles become about 10,000."""
 
 
 def human_rider(model: HumanModel, contacts: Contacts, rng: np.random.Generator) -> list[Part]:
@@ -48,7 +46,7 @@ def human_rider(model: HumanModel, contacts: Contacts, rng: np.random.Generator)
     pelvis = settle(contacts, stature, lambda place: pose_at(place)[0][trunk])
     posed, head = pose_at(pelvis)
     posed = posed + model.clothes(posed, rng)
-    parts = [merge_near(posed[used], faces.astype(np.int64), _DETAIL_M)]
+    parts = [merge_near(posed[used], faces.astype(np.int64), DETAIL_M)]
     if not contacts.pedals:
         parts.append(helmet(head + np.array([0.03, 0, 0.045]) * stature, stature))
     return parts
