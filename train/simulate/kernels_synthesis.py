@@ -31,7 +31,9 @@ CELLS = 4
 LANES = CELLS * RX
 LEG_PLANES = 4
 """Of receive legs, [capacity * LANES] each: weighted phasor (re, im), exponent of the weight over f, ratio of steps."""
-BLOCK = 32
+MEAN, RATE, MEAN_RATE = RX, RX + 1, 2 * RX + 1
+"""Rows of the paths' scratch: a group's receivers, their mean, how they change, and the mean of that."""
+BLOCK = 64
 """Scatterers of a block: distances are taken receiver by receiver over a block, so that they vectorise."""
 
 
@@ -96,9 +98,52 @@ def filter_amplitudes(count, points, amplitude, centre_m, cells_per_m, offset_m,
         filtered[1, k] = amplitude[k].real * factor.imag + amplitude[k].imag * factor.real
 
 
+@njit(inline="always")
+def _paths(first, size, points, velocity, antenna, t, path, row):  # type: ignore[no-untyped-def]
+    """Distances of a block's scatterers to one antenna at time ``t``.
+
+    One array is written in a loop of its own here and below: more would need too many checks for overlaps, and the loop
+    would not be vectorised.
+    """
+    ax, ay, az = antenna[0], antenna[1], antenna[2]
+    for i in range(size):
+        k = first + i
+        x = points[0, k] + velocity[0, k] * t - ax
+        y = points[1, k] + velocity[1, k] * t - ay
+        z = points[2, k] + velocity[2, k] * t - az
+        path[row, i] = math.sqrt(x * x + y * y + z * z)
+
+
+@njit(inline="always")
+def _extend(first, size, path, row, new, shortest, longest):  # type: ignore[no-untyped-def]
+    """Shortest and longest legs, ``new``: of the first antenna."""
+    begin = uint64(first)
+    for i in range(uint64(size)):
+        value = path[row, i]
+        shortest[begin + i] = value if new or value < shortest[begin + i] else shortest[begin + i]
+    for i in range(uint64(size)):
+        value = path[row, i]
+        longest[begin + i] = value if new or value > longest[begin + i] else longest[begin + i]
+
+
 @njit(**OPTIONS)
 def transmit_legs(  # type: ignore[no-untyped-def]
-    count, points, velocity, bend, amplitude, antennas, time_s, middle_s, scale, phasor, cell, base, reach
+    count,
+    points,
+    velocity,
+    bend,
+    amplitude,
+    antennas,
+    time_s,
+    middle_s,
+    scale,
+    re,
+    im,
+    cell,
+    base,
+    shortest,
+    longest,
+    path,
 ):
     """Amplitude times transmit phasor and place on the grid of every slot.
 
@@ -111,39 +156,41 @@ def transmit_legs(  # type: ignore[no-untyped-def]
         time_s: float64 [slots].
         middle_s: instant of which the receive paths are a tangent.
         scale: cells and turns per metre of path; turns per metre of every slot's jitter: float64 [2 + slots].
-        phasor: float32 [slots, 2, capacity], overwritten.
+        re, im: float32 [slots, capacity], overwritten: the phasors.
         cell: float32 [slots, capacity], overwritten: cell less ``base``.
         base: int32 [capacity], overwritten: whole cell of slot 0.
-        reach: float64 [2, capacity], overwritten: shortest and longest leg.
+        shortest, longest: float64 [capacity], overwritten: legs.
+        path: float64 [1, BLOCK], scratch.
     """
-    for m in range(len(time_s)):
-        t = time_s[m]
-        t2 = (t - middle_s) * (t - middle_s)
-        ax, ay, az = antennas[m, 0], antennas[m, 1], antennas[m, 2]
-        turns = scale[1] + scale[2 + m]
-        for k in range(count):
-            x = points[0, k] + velocity[0, k] * t - ax
-            y = points[1, k] + velocity[1, k] * t - ay
-            z = points[2, k] + velocity[2, k] * t - az
-            path_m = math.sqrt(x * x + y * y + z * z) + bend[k] * t2
-            cosine, sine = _phasor(path_m * turns)
-            phasor[m, 0, k] = amplitude[0, k] * cosine - amplitude[1, k] * sine
-            phasor[m, 1, k] = amplitude[0, k] * sine + amplitude[1, k] * cosine
-            place = path_m * scale[0]
-            base[k] = int32(place) if m == 0 else base[k]
-            cell[m, k] = float32(place - base[k])
-            reach[0, k] = path_m if m == 0 else min(reach[0, k], path_m)
-            reach[1, k] = path_m if m == 0 else max(reach[1, k], path_m)
+    for first in range(0, count, BLOCK):
+        size = min(BLOCK, count - first)
+        for m in range(len(time_s)):
+            later_s = time_s[m] - middle_s
+            turns, later_s2 = scale[1] + scale[2 + m], later_s * later_s
+            _paths(first, size, points, velocity, antennas[m], time_s[m], path, 0)
+            for i in range(size):
+                path[0, i] += bend[first + i] * later_s2
+            _extend(first, size, path, 0, m == 0, shortest, longest)
+            if m == 0:
+                for i in range(size):
+                    base[first + i] = int32(path[0, i] * scale[0])
+            for i in range(size):
+                cell[m, first + i] = float32(path[0, i] * scale[0] - base[first + i])
+            for i in range(size):
+                cosine, sine = _phasor(path[0, i] * turns)
+                k = first + i
+                re[m, k] = amplitude[0, k] * cosine - amplitude[1, k] * sine
+                im[m, k] = amplitude[0, k] * sine + amplitude[1, k] * cosine
 
 
 @njit(inline="always")
-def _write_legs(legs, first, size, work, b, factors):  # type: ignore[no-untyped-def]
+def _write_legs(legs, first, size, cosines, work, b, factors):  # type: ignore[no-untyped-def]
     """Lanes of a block of scatterers, from cosine, sine, place in the group and exp(b place) of every receiver."""
     span = len(legs) // LEG_PLANES
     for i in range(size):
         o = (first + i) * LANES
         for n in range(RX):
-            cosine, sine, away, rise, fall = work[0, n, i], work[1, n, i], work[2, n, i], work[3, n, i], work[4, n, i]
+            cosine, sine, away, rise, fall = cosines[n, i], work[0, n, i], work[1, n, i], work[2, n, i], work[3, n, i]
             twice = rise * rise
             level, ratio = fall * fall * fall, twice * twice * twice * twice
             for c in range(CELLS):
@@ -161,14 +208,66 @@ def _write_turns(turn, first, size, path, turns_s_per_m):  # type: ignore[no-unt
     for i in range(size):
         o = (first + i) * LANES
         for n in range(RX):
-            cosine, sine = _phasor(path[1, n, i] * turns_s_per_m)
+            cosine, sine = _phasor(path[RATE + n, i] * turns_s_per_m)
             for lane in range(n, LANES, RX):
                 turn[o + lane], turn[o + span + lane] = cosine, sine
 
 
+@njit(inline="always")
+def _rates(first, size, points, velocity, antenna, t, path, n):  # type: ignore[no-untyped-def]
+    """Change per second of the distances to receiver n."""
+    for i in range(size):
+        k = first + i
+        x = points[0, k] + velocity[0, k] * t - antenna[0]
+        y = points[1, k] + velocity[1, k] * t - antenna[1]
+        z = points[2, k] + velocity[2, k] * t - antenna[2]
+        dot = x * velocity[0, k] + y * velocity[1, k] + z * velocity[2, k]
+        path[RATE + n, i] = dot / math.sqrt(x * x + y * y + z * z)
+
+
+@njit(inline="always")
+def _mean(size, path, row):  # type: ignore[no-untyped-def]
+    """Mean of the group's four rows from ``row`` on, in the row after them."""
+    for i in range(size):
+        path[row + RX, i] = 0.25 * ((path[row, i] + path[row + 1, i]) + (path[row + 2, i] + path[row + 3, i]))
+
+
+@njit(inline="always")
+def _weigh(size, path, n, scale, back_s, shape, edge, cosines, work):  # type: ignore[no-untyped-def]
+    """Of receiver n: weighted cosine and sine at slot 0, place in the group, exp(b place) and its inverse."""
+    for i in range(size):
+        work[1, n, i] = float32((path[n, i] - path[MEAN, i]) * scale[0])
+    for i in range(size):
+        away = work[1, n, i]
+        level = _exp(-shape * away * (away + float32(2) * edge))
+        cosine, sine = _phasor((path[n, i] - path[RATE + n, i] * back_s - scale[2]) * scale[1])
+        cosines[n, i], work[0, n, i] = level * cosine, level * sine
+    for i in range(size):
+        work[2, n, i] = _exp(shape * work[1, n, i])
+    for i in range(size):
+        work[3, n, i] = _exp(-shape * work[1, n, i])
+
+
 @njit(**OPTIONS)
 def receive_legs(  # type: ignore[no-untyped-def]
-    count, points, velocity, antennas, scale, timing, shape, edge, factors, legs, turn, cell, base, reach, path, work
+    count,
+    points,
+    velocity,
+    antennas,
+    scale,
+    timing,
+    shape,
+    edge,
+    factors,
+    legs,
+    turn,
+    cell,
+    base,
+    shortest,
+    longest,
+    path,
+    cosines,
+    work,
 ):
     """Receive phasors with their share of the weights, group by group, and how they turn from slot to slot.
 
@@ -186,48 +285,37 @@ def receive_legs(  # type: ignore[no-untyped-def]
         turn: float32 [chips, 2 * span], overwritten: cosine and sine of the turn per slot.
         cell: float32 [2, chips, capacity], overwritten: middle of the group's cells less ``base``, change per second.
         base: int32 [capacity], overwritten.
-        reach: float64 [2, capacity], overwritten: shortest and longest leg.
-        path, work: float64 [2, RX, BLOCK] and float32 [5, RX, BLOCK], scratch.
+        shortest, longest: float64 [capacity], overwritten: legs.
+        path: float64 [2 * RX + 2, BLOCK], scratch, its rates 0 when nothing moves.
+        cosines, work: float32 [RX, BLOCK] and [4, RX, BLOCK], scratch.
     """
     middle_s, back_s, slot_s = timing[0], timing[0] - timing[1], timing[2]
     for first in range(0, count, BLOCK):
         size = min(BLOCK, count - first)
         for d in range(len(antennas)):
             for n in range(RX):
-                ax, ay, az = antennas[d, n, 0], antennas[d, n, 1], antennas[d, n, 2]
-                new = d == 0 and n == 0
+                _paths(first, size, points, velocity, antennas[d, n], middle_s, path, n)
+                _extend(first, size, path, n, d == 0 and n == 0, shortest, longest)
+                if slot_s > 0.0:
+                    _rates(first, size, points, velocity, antennas[d, n], middle_s, path, n)
+            if d == 0:
                 for i in range(size):
-                    k = first + i
-                    x = points[0, k] + velocity[0, k] * middle_s - ax
-                    y = points[1, k] + velocity[1, k] * middle_s - ay
-                    z = points[2, k] + velocity[2, k] * middle_s - az
-                    path_m = math.sqrt(x * x + y * y + z * z)
-                    path[0, n, i] = path_m
-                    path[1, n, i] = (x * velocity[0, k] + y * velocity[1, k] + z * velocity[2, k]) / path_m
-                    base[k] = int32(path_m * scale[0]) if new else base[k]
-                    reach[0, k] = path_m if new else min(reach[0, k], path_m)
-                    reach[1, k] = path_m if new else max(reach[1, k], path_m)
+                    base[first + i] = int32(path[0, i] * scale[0])
+            _mean(size, path, 0)
+            _mean(size, path, RX + 1)
             for i in range(size):
-                mean_m = 0.25 * (path[0, 0, i] + path[0, 1, i] + path[0, 2, i] + path[0, 3, i])
-                mean_m_s = 0.25 * (path[1, 0, i] + path[1, 1, i] + path[1, 2, i] + path[1, 3, i])
-                cell[0, d, first + i] = float32((mean_m - scale[2]) * scale[0] - base[first + i])
-                cell[1, d, first + i] = float32(mean_m_s * scale[0])
-                for n in range(RX):
-                    work[2, n, i] = float32((path[0, n, i] - mean_m) * scale[0])
+                cell[0, d, first + i] = float32((path[MEAN, i] - scale[2]) * scale[0] - base[first + i])
+            for i in range(size):
+                cell[1, d, first + i] = float32(path[MEAN_RATE, i] * scale[0])
             for n in range(RX):
-                for i in range(size):
-                    away = work[2, n, i]
-                    level = _exp(-shape * away * (away + float32(2) * edge))
-                    cosine, sine = _phasor((path[0, n, i] - path[1, n, i] * back_s - scale[2]) * scale[1])
-                    work[0, n, i], work[1, n, i] = level * cosine, level * sine
-                    work[3, n, i], work[4, n, i] = _exp(shape * away), _exp(-shape * away)
-            _write_legs(legs[d], first, size, work, shape, factors)
+                _weigh(size, path, n, scale, back_s, shape, edge, cosines, work)
+            _write_legs(legs[d], first, size, cosines, work, shape, factors)
             if slot_s > 0.0:
                 _write_turns(turn[d], first, size, path, slot_s * scale[1])
 
 
 @njit(inline="always")
-def _plan(count, phasor, cell_out, mean, drift, base, width, b, outer, first_ratio, plan, start):  # type: ignore[no-untyped-def]
+def _plan(count, re, im, cell_out, mean, drift, base, width, b, outer, first_ratio, plan, start):  # type: ignore[no-untyped-def]
     """First cell of every scatterer, place from its middle, and what it brings to the weights of one group."""
     for k in range(count):
         place = cell_out[k] + mean[k] + drift[k]
@@ -240,7 +328,7 @@ def _plan(count, phasor, cell_out, mean, drift, base, width, b, outer, first_rat
             level *= falling
         rising *= rising
         plan[0, k] = away
-        plan[1, k], plan[2, k] = phasor[0, k] * level, phasor[1, k] * level
+        plan[1, k], plan[2, k] = re[k] * level, im[k] * level
         plan[3, k] = first_ratio * rising * rising
 
 
@@ -263,7 +351,7 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
         plane: floats of one plane of a group's grid.
         moving: turn the legs from slot to slot.
     Returns:
-        Kernel of (count, phasor [slots, 2, capacity], cell_out [slots, capacity], cell_back [2, chips, capacity],
+        Kernel of (count, re, im [slots, capacity], cell_out [slots, capacity], cell_back [2, chips, capacity],
         time_s [slots] from the tangent's instant, base int32 [capacity], legs [chips, LEG_PLANES * span], turn [chips,
         2 * span], drift float32 [capacity], plan float32 [4, capacity], start int32 [capacity], grid float32 [chips *
         slots * 2 * plane]), the last three scratch, the grid added to.
@@ -275,7 +363,7 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
     bend = np.float32(math.exp(-32.0 * shape))
 
     @njit(**OPTIONS)
-    def spread(count, phasor, cell_out, cell_back, time_s, base, legs, turn, drift, plan, start, grid):  # type: ignore[no-untyped-def]
+    def spread(count, re_out, im_out, cell_out, cell_back, time_s, base, legs, turn, drift, plan, start, grid):  # type: ignore[no-untyped-def]
         slots, begin = len(time_s), uint64(0)
         for chip in range(len(legs)):
             leg_table, turns, span = legs[chip], turn[chip], uint64(legs.shape[1] // LEG_PLANES)
@@ -284,7 +372,21 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
                 t = float32(time_s[slot])
                 for k in range(count):
                     drift[k] = rate[k] * t
-                _plan(count, phasor[slot], cell_out[slot], mean, drift, base, width, b, outer, first_ratio, plan, start)
+                _plan(
+                    count,
+                    re_out[slot],
+                    im_out[slot],
+                    cell_out[slot],
+                    mean,
+                    drift,
+                    base,
+                    width,
+                    b,
+                    outer,
+                    first_ratio,
+                    plan,
+                    start,
+                )
                 for k in range(uint64(count)):
                     away, a, c, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
                     o, leg = begin + uint64(start[k]), k * lanes

@@ -63,7 +63,8 @@ class _Work:
     velocity: Float64
     bend: Float64
     amplitude: Float32
-    phasor: Float32
+    re: Float32
+    im: Float32
     cell_out: Float32
     base_out: NDArray[np.int32]
     reach_out: Float64
@@ -88,7 +89,8 @@ class _Work:
             velocity=np.zeros((2, 3, room), f8),
             bend=np.zeros(room, f8),
             amplitude=np.zeros((2, room), f4),
-            phasor=np.zeros((slots, 2, room), f4),
+            re=np.zeros((slots, room), f4),
+            im=np.zeros((slots, room), f4),
             cell_out=np.zeros((slots, room), f4),
             base_out=np.zeros(room, np.int32),
             reach_out=np.zeros((2, room), f8),
@@ -153,7 +155,8 @@ class Synthesizer:
         self._unfiltered = self._response = np.ones(cells + 1, dtype=np.complex64)
         self._filtered_by: FrontEnd | None = None
         self._moving, self._slot_s = False, profile.chirp_time_s
-        self._path, self._scratch = np.zeros((2, RX, BLOCK)), zeros((5, RX, BLOCK))
+        self._path, self._scratch = zeros((2 * RX + 2, BLOCK), np.float64), zeros((4, RX, BLOCK))
+        self._cosines = zeros((RX, BLOCK))
         self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
         self._beat: Complex64 | None = None
 
@@ -263,6 +266,7 @@ class Synthesizer:
         )
         work.bend[:k] = 0.0
         self._moving = bool(scatterers.velocity_m_s.any())
+        self._path[:] = 0.0
         if self._moving:
             away_m = work.points[1, :, :k] - self._centre_m[:, None]
             range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
@@ -281,20 +285,37 @@ class Synthesizer:
             out_scale[2:] = jitter_s * self._jitter_turns_per_m_s
         transmit_legs(
             *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
-            *(out_scale, work.phasor, work.cell_out, work.base_out, work.reach_out),
+            *(
+                out_scale,
+                work.re,
+                work.im,
+                work.cell_out,
+                work.base_out,
+                work.reach_out[0],
+                work.reach_out[1],
+                self._path[:1],
+            ),
         )
         timing = np.array([middle_s, time_s[0], self._slot_s if self._moving else 0.0])
         scale = np.array([self._cells_per_m, self._turns_per_m, self._offset_m])
         receive_legs(
             *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing),
             *(np.float32(SHAPES[self.width]), np.float32(self.width - 2), self._factors, work.legs, work.turn),
-            *(work.cell_back, work.base_back, work.reach_back, self._path, self._scratch),
+            *(
+                work.cell_back,
+                work.base_back,
+                work.reach_back[0],
+                work.reach_back[1],
+                self._path,
+                self._cosines,
+                self._scratch,
+            ),
         )
         self._require_reach(k)
         self._grid[:] = 0.0
         work.base[:k] = work.base_out[:k] + work.base_back[:k] + MARGIN
         self._spread[self._moving](
-            *(k, work.phasor, work.cell_out, work.cell_back, time_s - middle_s, work.base, work.legs, work.turn),
+            *(k, work.re, work.im, work.cell_out, work.cell_back, time_s - middle_s, work.base, work.legs, work.turn),
             *(work.drift, work.plan, work.start, self._grid),
         )
 
