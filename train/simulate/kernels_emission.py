@@ -32,6 +32,38 @@ def _loss_db(x: float, y: float, z: float, pattern: Float64) -> float:  # pragma
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _legs(
+    x: float, y: float, z: float, path: int, ground: Float64, pattern: Float64
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Amplitude of both legs of a path, pattern and ground included, and half its length (infinite: no such path).
+
+    ``x, y, z`` is the scatterer in the rig frame; ``ground`` and ``pattern`` are those of ``emit``.
+    """
+    direct = math.sqrt(x * x + y * y + z * z)
+    if x <= 0.0 or direct < NEAREST_M:
+        return 0.0, np.inf
+    leg = 0.0
+    if path != GROUND:
+        leg = 10.0 ** (-_loss_db(x / direct, y / direct, z / direct, pattern) / 20.0) / direct
+        if path == DIRECT:
+            return leg * leg, direct
+    height, permittivity = ground[3], abs(ground[4])
+    above = ground[0] * x + ground[1] * y + ground[2] * z + height
+    mx, my, mz = x - 2.0 * above * ground[0], y - 2.0 * above * ground[1], z - 2.0 * above * ground[2]
+    if mx <= 0.0 or above <= 0.0:
+        return 0.0, np.inf
+    image = math.sqrt(mx * mx + my * my + mz * mz)
+    sine = (above + height) / image
+    root = math.sqrt(permittivity - 1.0 + sine * sine)
+    numerator = sine if ground[4] < 0.0 else permittivity * sine
+    gamma = (numerator - root) / (numerator + root) * math.exp(-2.0 * ground[5] * sine * sine)
+    mirrored = gamma * 10.0 ** (-_loss_db(mx / image, my / image, mz / image, pattern) / 20.0) / image
+    if path == MIXED:
+        return leg * mirrored, 0.5 * (direct + image)
+    return mirrored * mirrored, image
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def emit(
     position: Float32,
     weight: Complex64,
@@ -66,39 +98,14 @@ def emit(
         out_image: bool [2, n], out: transmitter, receiver.
     """
     count = 0
-    normal_x, normal_y, normal_z, height = ground[0], ground[1], ground[2], ground[3]
-    permittivity, in_plane = abs(ground[4]), ground[4] < 0.0
     for i in range(len(path)):
         place = placing[owner[i]]
         px, py, pz = np.float64(position[i, 0]), np.float64(position[i, 1]), np.float64(position[i, 2])
         x = place[0, 0] * px + place[0, 1] * py + place[0, 2] * pz + place[3, 0]
         y = place[1, 0] * px + place[1, 1] * py + place[1, 2] * pz + place[3, 1]
         z = place[2, 0] * px + place[2, 1] * py + place[2, 2] * pz + place[3, 2]
-        direct = math.sqrt(x * x + y * y + z * z)
-        if x <= 0.0 or direct < NEAREST_M:
-            continue
-        loss_db, product, half_path, factor = 0.0, direct * direct, direct, 1.0
-        if path[i] != GROUND:
-            loss_db = _loss_db(x / direct, y / direct, z / direct, pattern)
-        if path[i] != DIRECT:
-            above = normal_x * x + normal_y * y + normal_z * z + height
-            mx, my, mz = x - 2 * above * normal_x, y - 2 * above * normal_y, z - 2 * above * normal_z
-            image = math.sqrt(mx * mx + my * my + mz * mz)
-            if mx <= 0.0 or above <= 0.0:
-                continue
-            sine = (above + height) / image
-            root = math.sqrt(permittivity - 1.0 + sine * sine)
-            numerator = sine if in_plane else permittivity * sine
-            gamma = (numerator - root) / (numerator + root) * math.exp(-2.0 * ground[5] * sine * sine)
-            image_db = _loss_db(mx / image, my / image, mz / image, pattern)
-            if path[i] == MIXED:
-                factor, loss_db, product = gamma, loss_db + image_db, direct * image
-                half_path = 0.5 * (direct + image)
-            else:
-                factor, loss_db, product, half_path = gamma * gamma, 2.0 * image_db, image * image, image
-        if path[i] == DIRECT:
-            loss_db *= 2.0
-        size = limits[1] * board[i] * factor * 10.0 ** (-loss_db / 20.0) / product
+        legs, half_path = _legs(x, y, z, path[i], ground, pattern)
+        size = limits[1] * board[i] * legs
         if half_path >= limits[0] or abs(weight[i]) * abs(size) < limits[2]:
             continue
         for turn in range(2 if path[i] == MIXED else 1):

@@ -19,6 +19,8 @@ DIRECT, MIXED, GROUND = 0, 1, 2
 """Path classes: both legs direct; one of them by way of the ground (two channels of equal weight); both."""
 SEEN, SEEN_IN_GROUND = 1, 2
 """Bits of the visibility of a point: from the radar, from its image below the ground."""
+PatchColumns = tuple[Float32, Float32, Float32, Float32, Float32]
+
 LEAST_AREA_M2 = 1e-12
 """Triangles of less are a line."""
 SERIES_BELOW = 0.02
@@ -163,15 +165,12 @@ def _lobe(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _patch_weight(
     p: int,
-    shape: Float32,
-    area: Float32,
-    spread: Float32,
-    reflection: Float32,
-    roughness: Float32,
+    columns: PatchColumns,
     legs: tuple[Float64, float, float, float, Float64],
 ) -> tuple[complex, float]:  # pragma: no cover - compiled
     """sqrt(sigma) exp(j phase) of one patch, m, and 1 / (R_t R_r); ``legs``: eye, z of both ends, k, limits."""
     eye, z_tx, z_rx, k, limits = legs
+    shape, area, spread, reflection, roughness = columns
     size, incidence, curved, qx, qy, qz, spreading = _lobe(shape[p], area[p], spread[p], eye, z_tx, z_rx, k, limits)
     scale = k / math.sqrt(math.pi) * incidence * reflection[p] * math.exp(-roughness[p] * incidence * incidence)
     if curved:
@@ -182,11 +181,7 @@ def _patch_weight(
 @njit(cache=True, nogil=True, error_model="numpy")
 def patch_weights(
     candidate: Int32,
-    shape: Float32,
-    area: Float32,
-    spread: Float32,
-    reflection: Float32,
-    roughness: Float32,
+    columns: PatchColumns,
     seen: UInt8,
     eye: Float64,
     path: int,
@@ -205,40 +200,40 @@ def patch_weights(
 
     Args:
         candidate: int32 [c], numbers of the patches that may matter.
-        shape, area, spread, reflection, roughness: columns of the patches (``points.Patches``).
+        columns: shape, area, spread, reflection and roughness of the patches (``points.Patches``).
         seen: uint8 [c], bits SEEN and SEEN_IN_GROUND of the candidates.
         eye: float64 [4], the radar in the object's frame, x, y, z, and the z of its image below the ground.
-        path: DIRECT, MIXED or GROUND.
-        wavelength: metres.
+        path, wavelength: DIRECT, MIXED or GROUND; metres.
         limits: float64 [2], q_t^2 A beyond which a flat patch and sin^2 of the angle off its normal beyond which any
             patch sends nothing; it fades from half of it on.
         keep: share of the greatest |level|^2 below which an entry need not be written.
         bound: float32 [c], scratch.
         index, weight, level: out: patch, sqrt(sigma) exp(j phase) in m, and |weight| / (R_t R_r).
     """
+    if len(candidate) == 0:
+        return 0
     k = 2.0 * math.pi / wavelength
+    shape, area, spread, reflection, _ = columns
     need = SEEN if path == DIRECT else SEEN_IN_GROUND if path == GROUND else SEEN | SEEN_IN_GROUND
     z_tx, z_rx = eye[3] if path == GROUND else eye[2], eye[2] if path == DIRECT else eye[3]
     legs = (eye, z_tx, z_rx, k, limits)
-    best, most = -1, 0.0
     for i in range(len(candidate)):
         bound[i] = 0.0
         if seen[i] & need == need:
             p = candidate[i]
             size, incidence, _, _, _, _, spreading = _lobe(shape[p], area[p], spread[p], eye, z_tx, z_rx, k, limits)
             bound[i] = k / math.sqrt(math.pi) * incidence * size * reflection[p] * spreading
-            if bound[i] > most:
-                best, most = i, bound[i]
-    if best < 0:
+    best = np.argmax(bound[: len(candidate)])
+    if bound[best] == 0.0:
         return 0
     # The patch that may be the strongest comes first: most of the others then need no integral.
-    value, spreading = _patch_weight(candidate[best], shape, area, spread, reflection, roughness, legs)
+    value, spreading = _patch_weight(candidate[best], columns, legs)
     strongest, count = abs(value) * spreading, 0
     share = math.sqrt(keep)
     for i in range(len(candidate)):
         if bound[i] < share * strongest or bound[i] == 0.0:
             continue
-        value, spreading = _patch_weight(candidate[i], shape, area, spread, reflection, roughness, legs)
+        value, spreading = _patch_weight(candidate[i], columns, legs)
         received = abs(value) * spreading
         if received < share * strongest or received == 0.0:
             continue

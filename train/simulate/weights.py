@@ -154,7 +154,7 @@ class Weigher:
         for path in self._paths:
             mirror = self._mirror(eye_m, 0.5 * (surface.low_m + surface.high_m)) ** path
             count = patch_weights(
-                *(sight.candidates, p.shape, p.area, p.spread, p.reflection, p.roughness, sight.patches, eye_m, path),
+                *(sight.candidates, (p.shape, p.area, p.spread, p.reflection, p.roughness), sight.patches, eye_m, path),
                 *(self._wavelength_m, self._limits, keep, self._bound, self._index, self._weight, self._level),
             )
             found.append(self._entries(number, path, mirror, count, p.shape[:, 0], p.board))
