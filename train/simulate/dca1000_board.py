@@ -91,6 +91,7 @@ class Dca1000Board:
         settings: behaviour.
         faults: channels ``<radar>/command`` (replies and status) and ``<radar>/data``.
         reset_radar: pulls the radar's reset line.
+        streaming: whether the radar's frames are running.
     Attributes:
         address: of the command port.
         violations: what the host did wrong, in words.
@@ -109,6 +110,7 @@ class Dca1000Board:
         settings: Dca1000Settings | None = None,
         faults: Faults | None = None,
         reset_radar: Callable[[], None] = lambda: None,
+        streaming: Callable[[], bool] = lambda: False,
     ) -> None:
         self.radar, self.settings = radar, settings or Dca1000Settings()
         self.violations: list[str] = []
@@ -120,7 +122,7 @@ class Dca1000Board:
         self.data_target = self.settings.data_target
         """Where samples go; None: port 4098 (or the EEPROM's) of whoever sent the last command."""
         self._data_port = DATA_PORT
-        self._faults, self._reset_radar = faults, reset_radar
+        self._faults, self._reset_radar, self._streaming = faults, reset_radar, streaming
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((self.settings.host, self.settings.command_port))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**21)
@@ -131,7 +133,7 @@ class Dca1000Board:
         self._data = FaultyChannel(faults, f"{radar}/data", self._send_data, self._later, self.unplug)
         self._carry = b""
         self._deaf_until_s = self._last_data_s = self._started_s = 0.0
-        self._watching = self._full = self._closing = False
+        self._watching = self._full = self._misaligned = self._closing = False
         self._powered = True
         self._thread = threading.Thread(target=self._run, name=f"{radar} card commands", daemon=True)
 
@@ -178,7 +180,7 @@ class Dca1000Board:
             period_s: frame period, to see whether the packet delay lets them pass.
         """
         with self._lock:
-            before_s, self._last_data_s = self._last_data_s, time.monotonic()
+            self._last_data_s = time.monotonic()
             if not self.recording or not self._powered:
                 return
             if self.configuration is None or not self.configuration.streams_raw:
@@ -189,16 +191,12 @@ class Dca1000Board:
                 self._full = True
                 self._complain("the packet delay is too long for this data rate")
                 self._status(LVDS_BUFFER_FULL)
-            if self.sent_bytes == 0 and not self._carry and self._misaligned(before_s):
-                samples = samples[len(samples) // 3 & ~1 :]
+            if self._misaligned:
+                self._misaligned, samples = False, samples[len(samples) // 3 & ~1 :]
             self._watch()
             self._packetize(samples, interval_s / self.settings.pace if self.settings.pace > 0 else 0.0)
 
     # --- data
-
-    def _misaligned(self, before_s: float) -> bool:
-        """Whether samples were under way when the recording began."""
-        return 0 < before_s < self._started_s and before_s >= self._started_s - self.settings.flush_s
 
     def _packetize(self, samples: bytes | memoryview, interval_s: float) -> None:
         data = memoryview(self._carry + bytes(samples)) if self._carry else memoryview(samples).cast("B")
@@ -324,7 +322,8 @@ class Dca1000Board:
         if self.configuration is None or self.packet_delay_s is None:
             self._complain("record start without configuration or packet delay")
         self._started_s = time.monotonic()
-        if self._misaligned(self._last_data_s):
+        self._misaligned = self._streaming()
+        if self._misaligned:
             self._complain("record start while the radar sends: the byte count is not aligned to frames")
         self.recording, self.sent_bytes, self.packets, self._carry, self._full = True, 0, 0, b"", False
         self._later.call(self.settings.no_data_s, self._no_data, self._started_s)

@@ -125,9 +125,10 @@ class DemoRadar:
             self._end()
         ended = [join(self._thread), self._later.close(), *(bursts.stop() for bursts in self._ended)]
         self._close()
-        with contextlib.suppress(OSError):
-            os.close(self._wake_read)
-            os.close(self._wake_write)
+        for handle in (self._wake_read, self._wake_write):
+            if handle >= 0:
+                os.close(handle)
+        self._wake_read = self._wake_write = -1
         return all(ended)
 
     def __enter__(self) -> DemoRadar:
@@ -137,6 +138,12 @@ class DemoRadar:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+    @property
+    def streaming(self) -> bool:
+        """Frames are running."""
+        running = self._running
+        return running is not None and running.alive
 
     @property
     def late(self) -> int:

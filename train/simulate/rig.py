@@ -262,7 +262,9 @@ class VirtualRig:
         port = COMMAND_PORT if s.real_ports else s.card.command_port
         target = s.data_targets.get(radar, s.card.data_target)
         own = replace(s.card, host=self._host(radar), command_port=port, data_target=target, pace=s.pace)
-        card = Dca1000Board(radar, own, self.faults, lambda: self.radars[radar].reset())
+        card = Dca1000Board(
+            radar, own, self.faults, lambda: self.radars[radar].reset(), lambda: self.radars[radar].streaming
+        )
         link = s.links / radar if s.links is not None else s.demo.link
         demo = DemoRadar(
             radar, self._supply, card.lvds, replace(s.demo, device=device, link=link, pace=s.pace), self.faults

@@ -315,6 +315,9 @@ class Tda2Board:
         free = [c.number for c in self.chips[1:] if c.running and c.frame is not None and c.frame.trigger == MASTER]
         if free:
             self.complain(f"slaves {free} run by software trigger: their frames are not the master's")
+        told_ms = self.recorder.settings.period_ms
+        if chip.frame is not None and told_ms is not None and told_ms != int(chip.frame.period * FRAME_LSB_NS * 1e-6):
+            self.complain(f"recorder was told {told_ms} ms, frames come every {chip.frame.period * 5e-6:g} ms")
         if not self.recorder.recording:
             self.complain("frames were started before the recorder")
         frame = chip.frame

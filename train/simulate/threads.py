@@ -100,6 +100,11 @@ class Bursts:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bursts", daemon=True)
 
+    @property
+    def alive(self) -> bool:
+        """More bursts will come."""
+        return self._thread.is_alive() and not self._stop.is_set()
+
     def start(self) -> None:
         """Begin."""
         self._thread.start()
