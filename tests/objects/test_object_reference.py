@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_object_library import write_library
 
-from tests.objects.test_object_library import write_library
 from train.objects.library import SPLITS, read_manifest
 from train.objects.mesh import CLASSES, ClassName, MeshError
 from train.objects.parametric import generate
