@@ -20,8 +20,8 @@ from train.simulate.surface_settings import SurfaceSettings
 
 Range = tuple[float, float]
 FRAME_PERIOD_S = 1.0 / 60.0
-CLUTTER_POINTS = 2048
-"""Two a square metre: fewer would stand out one by one, as no ground does."""
+CLUTTER_POINTS = 8192
+"""Eight a square metre: fewer would stand out one by one, as no ground does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Ranges:
     ground_share: float = 1.0
     permittivity: Range = (3.0, 5.0)
     ground_roughness_m: Range = (0.3e-3, 2e-3)
-    clutter_db: Range = (-32.0, -18.0)
+    clutter_db: Range = (-36.0, -22.0)
     reflection_db: Range = (-3.0, 0.0)
     diffuse_db: Range = (-3.0, 3.0)
     points_db: Range = (-3.0, 3.0)

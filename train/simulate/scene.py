@@ -12,7 +12,6 @@ import numpy as np
 
 from edge.frames import Float64
 from train.objects.mesh import CLASSES, ClassName, Mesh
-from train.objects.primitives import box, join
 from train.objects.reference import ObjectRef
 from train.simulate.settings import SceneSettings
 from train.simulate.surface import Placed, Surface, make_surface
@@ -22,7 +21,8 @@ POOL = 2
 """Neighbours of a class to choose from; their surfaces are made once in a process."""
 POOL_NEAREST_M = 3.0
 """Distance for which their patches are fine enough."""
-WALL_SIZE_M = (14.0, 0.2, 2.5)
+WALL_SIZE_M = (14.0, 2.5)
+"""Length and height; it has no thickness."""
 WALL_DB = -9.0
 """Concrete instead of sheet metal: 0.32 of 0.95 in amplitude."""
 MOVERS: tuple[ClassName, ...] = ("pedestrian", "bicycle")
@@ -84,7 +84,7 @@ def make_scene(
     for side in rng.permutation(np.arange(scene.neighbours) % len(SIDES)):
         placed.append(_neighbour(SIDES[side], boxes, scene, wavelength_m, rng))
     if scene.wall_m > 0:
-        behind_m = max(one.high_m[1] for one in boxes) + scene.wall_m + 0.5 * WALL_SIZE_M[1]
+        behind_m = max(one.high_m[1] for one in boxes) + scene.wall_m
         placed.append(_static(_wall(wavelength_m), np.array([0.5 * travel_m, behind_m, 0.0]), 0.0))
     if scene.mover_speed_m_s != 0:
         placed.append(_mover(boxes[0], scene, duration_s, wavelength_m, rng))
@@ -141,7 +141,9 @@ def _pool(name: ClassName, number: int, wavelength_m: float) -> tuple[Mesh, Surf
 
 @lru_cache(maxsize=2)
 def _wall(wavelength_m: float) -> Surface:
-    vertices, faces = join([box((0.0, 0.0, 0.5 * WALL_SIZE_M[2]), WALL_SIZE_M)])
+    x_m, z_m = 0.5 * WALL_SIZE_M[0], WALL_SIZE_M[1]
+    vertices = np.array([[-x_m, 0, 0], [x_m, 0, 0], [x_m, 0, z_m], [-x_m, 0, z_m]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     settings = SurfaceSettings(reflection_db=WALL_DB)
     return make_surface(Mesh(vertices, faces, 0, "scene/wall"), settings, 6.0, wavelength_m, np.random.default_rng(0))
 
