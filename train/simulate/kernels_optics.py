@@ -197,17 +197,15 @@ def patch_weights(
 
     sqrt(sigma) = sqrt(4 pi) / lambda |Gamma| c I(q), q = -2 pi / lambda (u_t + u_r) with u the unit vectors from the
     patch to the ends of the two legs (phases grow with the path's length), c = |N . (u_t + u_r)| / 2.
-
     Args:
         candidate: int32 [c], numbers of the patches that may matter.
         columns: shape, area, spread, reflection and roughness of the patches (``points.Patches``).
         seen: uint8 [c], bits SEEN and SEEN_IN_GROUND of the candidates.
         eye: float64 [4], the radar in the object's frame, x, y, z, and the z of its image below the ground.
         path, wavelength: DIRECT, MIXED or GROUND; metres.
-        limits: float64 [2], q_t^2 A beyond which a flat patch and sin^2 of the angle off its normal beyond which any
-            patch sends nothing; it fades from half of it on.
-        keep: share of the greatest |level|^2 below which an entry need not be written.
-        bound: float32 [c], scratch.
+        limits: float64 [2], q_t^2 A beyond which a flat patch, and sin^2 of the angle off its normal beyond which any
+            patch sends nothing; both fade from half of it on.
+        keep: share of the greatest |level|^2 below which an entry is not wanted. bound: float32 [c], scratch.
         index, weight, level: out: patch, sqrt(sigma) exp(j phase) in m, and |weight| / (R_t R_r).
     """
     if len(candidate) == 0:

@@ -151,16 +151,25 @@ class Weigher:
         surface, keep = self._surfaces[number], 10 ** (-self._settings.keep_db / 10)
         p, q = surface.patches, surface.points
         found: list[Entries] = []
+        out = (self._index, self._weight, self._level)
         for path in self._paths:
             mirror = self._mirror(eye_m, 0.5 * (surface.low_m + surface.high_m)) ** path
             count = patch_weights(
-                *(sight.candidates, (p.shape, p.area, p.spread, p.reflection, p.roughness), sight.patches, eye_m, path),
-                *(self._wavelength_m, self._limits, keep, self._bound, self._index, self._weight, self._level),
+                sight.candidates,
+                (p.shape, p.area, p.spread, p.reflection, p.roughness),
+                sight.patches,
+                eye_m,
+                path,
+                self._wavelength_m,
+                self._limits,
+                keep,
+                self._bound,
+                *out,
             )
             found.append(self._entries(number, path, mirror, count, p.shape[:, 0], p.board))
             count = point_weights(
                 *(q.position, q.axis, q.kind, q.amplitude, q.length, sight.points, eye_m, path, self._wavelength_m),
-                *(self._index, self._weight, self._level),
+                *out,
             )
             found.append(self._entries(number, path, mirror, count, q.position, q.board))
         every = join(found)
