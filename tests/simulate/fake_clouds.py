@@ -27,7 +27,7 @@ def small_plan(seed: int = 0, **sizes: int) -> Plan:
     recipe = Recipe().resized(**SIZE | sizes)  # type: ignore[arg-type]
     count = recipe.set.objects
     names = ("car", "bicycle", "motorcycle", "pedestrian")
-    return Plan(recipe, seed, tuple(f"{names[k % 4]}/parametric_{k:05d}" for k in range(count)))
+    return Plan(recipe.settings, "", seed, tuple(f"{names[k % 4]}/parametric_{k:05d}" for k in range(count)))
 
 
 class Here:

@@ -117,7 +117,7 @@ def test_a_damaged_shard_is_remade_and_no_other(whole: Path, tmp_path: Path, dam
     [
         (small_plan(seed=1), r"seed = 1 \(0\)"),
         (small_plan(drive_bys=3), r"set.drive_bys = 3 \(2\)"),
-        (Plan(small_plan().recipe, 0, (*small_plan().objects[:-1], "car/parametric_00099")), "parametric_00099"),
+        (Plan(small_plan().settings, "", 0, (*small_plan().objects[:-1], "car/parametric_00099")), "parametric_00099"),
     ],
 )
 def test_another_set_in_the_same_folder_is_refused(whole: Path, other: Plan, named: str) -> None:

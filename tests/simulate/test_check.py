@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from fake_clouds import Here, fake_cloud, small_plan
 
-from edge.errors import RecordingError
+from edge.errors import ConfigError, RecordingError
 from train.simulate.build import INDEX, build, shard_name, write_index
 from train.simulate.check import check, implausible, show
 from train.simulate.shards import Cloud, Shard, encode, read_shard
+from train.simulate.work import Plan
 
 
 @pytest.fixture
@@ -152,3 +153,16 @@ def test_numbers_that_cannot_be_are_named(changes: dict[str, Any], named: str) -
     cloud = fake_cloud(next(small_plan().items(0)))
     assert implausible(cloud) == ""
     assert named in implausible(replace(cloud, **changes))
+
+
+def test_a_set_of_other_settings_than_todays_can_still_be_checked(folder: Path) -> None:
+    """A later version has another setting: the old set stays what it is; only going on with it is refused."""
+    plan = small_plan()
+    older = Plan(plan.settings | {"gone": 1}, plan.text, plan.seed, plan.objects)
+    for number in range(plan.shards):
+        path = folder / shard_name(number)
+        path.write_bytes(encode(replace(read_shard(path), identity=older.identity)))
+    write_index(older, folder)
+    assert check(folder).good
+    with pytest.raises(ConfigError, match=r"gone = None \(1\)"):
+        build(plan, folder, Here(), fake_cloud)

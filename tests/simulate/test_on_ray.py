@@ -87,5 +87,6 @@ def test_an_item_that_hangs_is_stopped(two_workers: RayPool, monkeypatch: pytest
 
 
 def test_no_cluster_is_an_error_that_says_so(two_workers: RayPool) -> None:
-    with pytest.raises(RfconstructError, match="no Ray cluster"):
-        RayPool("nowhere:1")
+    for address in ("127.0.0.1:1", "ray://127.0.0.1:1", "127.0.0.1:port", "nowhere.invalid:1"):
+        with pytest.raises(RfconstructError, match="no Ray cluster"):
+            RayPool(address)

@@ -109,3 +109,17 @@ def test_a_cloud_keeps_its_seed_when_the_set_grows() -> None:
     shared = set(small.items(0)) & set(large.items(0))
     assert len(shared) == len(list(small.items(0)))
     assert item_seed(3, small.objects[0], "simulated", 0) in {item.seed for item in shared}
+
+
+def test_a_plan_gives_its_recipe_back() -> None:
+    recipe = load_recipe("equal").resized(objects=2)
+    plan = Plan.make(recipe, 0)
+    assert plan.recipe == recipe
+    assert plan.recipe.sha256 == recipe.sha256
+
+
+def test_riders_are_people_of_the_same_split_on_two_wheelers(plan: Plan) -> None:
+    for ref in (ObjectRef.from_text(text) for text in plan.objects if "@" in text):
+        assert ref.class_name in ("bicycle", "motorcycle")
+        assert ref.rider is not None
+        assert ("train", "val", "test")[int(ref.rider.lstrip("adehimnru")) % 3] == ref.split

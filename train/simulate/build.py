@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from edge.errors import ConfigError, RecordingError
-from edge.rig_toml import Place, fill
 from train.objects.reference import ObjectRef
 from train.perturb import perturb
 from train.simulate.cloud_statistics import measure
 from train.simulate.pool import Failure, Pool
 from train.simulate.progress import Progress
-from train.simulate.recipe import Recipe
+from train.simulate.recipe import Recipe, differences, digest
 from train.simulate.shards import (
     SUFFIX,
     Cloud,
@@ -185,7 +184,7 @@ def _claim(plan: Plan, folder: Path) -> None:
     """Make the folder this plan's, or find that it is already."""
     if (folder / INDEX).exists():
         there = read_plan(folder)
-        differ = plan.recipe.differences(there.recipe)
+        differ = differences(plan.settings, there.settings)
         if plan.seed != there.seed:
             differ.append(f"seed = {plan.seed} ({there.seed})")
         if not differ and plan.objects != there.objects:
@@ -231,11 +230,12 @@ def read_plan(folder: Path) -> Plan:
     """
     index = read_index(folder)
     try:
-        recipe = fill(Recipe, index["recipe"]["settings"] | {"text": index["recipe"]["text"]}, Place(folder / INDEX))
-        plan = Plan(recipe, int(index["seed"]), tuple(index["objects"]))
-    except (KeyError, TypeError, ValueError, ConfigError) as error:
-        raise RecordingError(f"{folder / INDEX}: contradicts itself ({error})") from error
-    if plan.identity != index.get("identity"):
+        recipe = index["recipe"]
+        plan = Plan(recipe["settings"], recipe["text"], int(index["seed"]), tuple(index["objects"]))
+        right = plan.per_object > 0 and plan.identity == index["identity"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f"{folder / INDEX}: contradicts itself ({error!r})") from error
+    if not right:
         raise RecordingError(f"{folder / INDEX}: recipe, seed and objects do not fit its identity")
     return plan
 
@@ -274,13 +274,12 @@ def write_index(plan: Plan, folder: Path) -> list[Shard]:
 
 def _index(plan: Plan, shards: list[Shard], files: list[dict[str, Any]]) -> bytes:
     """index.json, one line a sample."""
-    settings = {name: value for name, value in asdict(plan.recipe).items() if name != "text"}
     head = {
         "schema": SCHEMA,
         "complete": len(shards) == plan.shards,
         "identity": plan.identity,
         "seed": plan.seed,
-        "recipe": {"sha256": plan.recipe.sha256, "text": plan.recipe.text, "settings": settings},
+        "recipe": {"sha256": digest(plan.settings), "text": plan.text, "settings": plan.settings},
         "objects": plan.objects,
         "shards": files,
     }

@@ -60,7 +60,7 @@ def check(folder: Path) -> Report:
     """
     plan, index = read_plan(folder), read_index(folder)
     report = Report(plan)
-    recorded = {one["file"]: one["sha256"] for one in index["shards"]}
+    recorded = {one.get("file"): one.get("sha256") for one in index.get("shards", [])}
     shards = []
     for number in range(plan.shards):
         path = folder / shard_name(number)
@@ -124,9 +124,10 @@ def implausible(cloud: Cloud) -> str:
 
 def _index_faults(index: dict[str, object], shards: list[Shard], clouds: list[Cloud]) -> Iterator[str]:
     """index.json against the shards."""
-    samples = index["samples"]
-    assert isinstance(samples, list)
-    if not index["complete"]:
+    samples = index.get("samples")
+    if not isinstance(samples, list) or not all(isinstance(one, dict) for one in samples):
+        yield f"{INDEX}: no list of samples"
+    elif not index.get("complete"):
         yield f"{INDEX}: the set is not complete; the same command goes on"
     elif len(samples) != len(clouds):
         yield f"{INDEX}: names {len(samples)} clouds, the shards hold {len(clouds)}"

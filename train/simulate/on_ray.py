@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
@@ -19,6 +20,7 @@ R = TypeVar("R")
 _DIED = "its process died"
 _AHEAD = 4
 """Tasks handed out for every core of the cluster: enough to keep all busy, few enough to stop quickly."""
+_CONNECT_S = 5.0
 _GROWTH_S = 10.0
 """How often the number of cores is looked up again: a cluster may grow and shrink."""
 
@@ -41,6 +43,7 @@ class RayPool:
             import ray
         except ImportError as error:
             raise DependencyError("--address needs Ray", action="pip install 'rfconstruct[cluster]'") from error
+        _require_open(address)
         self._ray: Any = ray
         self._limit_s = limit_s
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to anybody
@@ -48,9 +51,7 @@ class RayPool:
         try:
             ray.init(address=address, log_to_driver=False, configure_logging=False, **local)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-            raise RfconstructError(
-                "no Ray cluster answers", value=address, allowed="auto, host:6379, ray://host:10001", action=str(error)
-            ) from error
+            raise _no_cluster(address, error) from error
 
     def run(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R | Failure]]:
         """See ``pool.Pool``: a task whose process or node dies is run once more by Ray, one that raises as well."""
@@ -90,6 +91,26 @@ class RayPool:
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
+
+
+def _require_open(address: str) -> None:
+    """Refuse a host and port where nobody listens; Ray itself would go on trying for minutes.
+
+    Raises:
+        RfconstructError: no connection.
+    """
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon:
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise _no_cluster(address, error) from error
+
+
+def _no_cluster(address: str, error: Exception) -> RfconstructError:
+    allowed = "auto, host:6379, ray://host:10001 or local"
+    return RfconstructError(f"no Ray cluster answers ({error})", value=address, allowed=allowed)
 
 
 def _run(function: Callable[[T], R], item: T, limit_s: float) -> R | Failure:

@@ -148,18 +148,25 @@ class Recipe:
     @property
     def sha256(self) -> str:
         """Of all values, those left at their default included; the text of the file does not count."""
-        return digest({name: value for name, value in asdict(self).items() if name != "text"})
+        return digest(self.settings)
 
-    def differences(self, other: Recipe) -> list[str]:
-        """``key = value here (value there)`` for every value that differs."""
-        here, there = (dict(_flat("", asdict(one))) for one in (self, other))
-        keys = [key for key in sorted(here | there) if key != "text" and here.get(key) != there.get(key)]
-        return [f"{key} = {here.get(key)} ({there.get(key)})" for key in keys]
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All values as JSON has them."""
+        settings: dict[str, Any] = _plain({name: value for name, value in asdict(self).items() if name != "text"})
+        return settings
 
     def resized(self, **sizes: int | None) -> Recipe:
         """Another size: fields of ``SetSettings``; None leaves a value as it is."""
         given = {name: value for name, value in sizes.items() if value is not None}
         return replace(self, set=replace(self.set, **given))
+
+
+def differences(here: dict[str, Any], there: dict[str, Any]) -> list[str]:
+    """``key = value here (value there)`` for every value of two recipes' settings that differs."""
+    one, other = dict(_flat("", here)), dict(_flat("", there))
+    keys = [key for key in sorted(one | other) if one.get(key) != other.get(key)]
+    return [f"{key} = {one.get(key)} ({other.get(key)})" for key in keys]
 
 
 def digest(value: object) -> str:

@@ -6,9 +6,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from edge.rig_toml import Place, fill
 from train.objects.human import HUMAN_ORIGIN
 from train.objects.library import PROCEDURAL, SPLITS, Split, default_objects_dir
 from train.objects.mesh import CLASSES, ClassName
@@ -46,24 +49,26 @@ class Plan:
     """What a data set is to hold.
 
     Args:
-        recipe: of the set.
+        settings: of the recipe, as JSON has them; a set can be checked even when this software has others by now.
+        text: of the recipe's file.
         seed: of the set.
         objects: text forms of the ObjectRefs, in the order of the work.
     """
 
-    recipe: Recipe
+    settings: dict[str, Any]
+    text: str
     seed: int
     objects: tuple[str, ...]
 
     @classmethod
     def make(cls, recipe: Recipe, seed: int) -> Plan:
         """Choose the objects; with the same library the same recipe and seed give the same list everywhere."""
-        return cls(recipe, seed, tuple(ref.to_text() for ref in choose_objects(recipe, seed)))
+        return cls(recipe.settings, recipe.text, seed, tuple(ref.to_text() for ref in choose_objects(recipe, seed)))
 
     @property
     def identity(self) -> str:
         """Hash of recipe, seed and objects: shards of another identity do not belong to the set."""
-        return digest([self.recipe.sha256, self.seed, self.objects])
+        return digest([digest(self.settings), self.seed, self.objects])
 
     @property
     def shards(self) -> int:
@@ -73,7 +78,22 @@ class Plan:
     @property
     def per_object(self) -> int:
         """Clouds of one object."""
-        return self.recipe.set.drive_bys + self.recipe.set.perturbed
+        return sum(self.counts.values())
+
+    @property
+    def counts(self) -> dict[Kind, int]:
+        """Clouds of one object by kind."""
+        size = self.settings["set"]
+        return {"simulated": int(size["drive_bys"]), "perturbed": int(size["perturbed"])}
+
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe itself.
+
+        Raises:
+            ConfigError: this software does not know all of its settings any more.
+        """
+        return fill(Recipe, self.settings | {"text": self.text}, Place(Path("recipe")))
 
     def shard_objects(self, number: int) -> tuple[str, ...]:
         """Objects of a shard."""
@@ -81,10 +101,9 @@ class Plan:
 
     def items(self, number: int) -> Iterator[Item]:
         """Clouds of a shard, in the order in which they are stored."""
-        counts = {"simulated": self.recipe.set.drive_bys, "perturbed": self.recipe.set.perturbed}
         for name in self.shard_objects(number):
             for kind in KINDS:
-                for variation in range(counts[kind]):
+                for variation in range(self.counts[kind]):
                     yield Item(name, kind, variation, item_seed(self.seed, name, kind, variation))
 
 
