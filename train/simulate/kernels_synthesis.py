@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from numba import float32, int32, njit, uint64
-from numpy.typing import NDArray
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
@@ -58,18 +57,6 @@ def _exp(y):  # type: ignore[no-untyped-def]
     p = float32(1 / 24) + y * (float32(1 / 120) + y * (float32(1 / 720) + y * p))
     p = float32(1 / 2) + y * (float32(1 / 6) + y * p)
     return float32(1) + y * (float32(1) + y * p)
-
-
-def lane_factors(shape: float, width: int) -> NDArray[np.float32]:
-    """Constants of the four cells of a step: of the first step's weight, and of its ratio to the next [2, CELLS].
-
-    Args:
-        shape: of the weights exp(-shape distance^2).
-        width: cells to either side of a scatterer, even.
-    """
-    offset = np.arange(CELLS) - 0.5 * (CELLS - 1)
-    exponents = -shape * np.square(offset) + 2.0 * shape * (width - 2) * offset, -8.0 * shape * offset
-    return np.exp(np.stack(exponents)).astype(np.float32)
 
 
 @njit(**OPTIONS)
@@ -274,18 +261,16 @@ def receive_legs(  # type: ignore[no-untyped-def]
     A leg is its tangent at one instant; the transmit leg carries the common curvature.
 
     Args:
-        count: scatterers.
-        points, velocity: float64 [3, capacity].
+        count, points, velocity: as for ``transmit_legs``.
         antennas: float64 [chips, RX, 3].
         scale: cells and turns per metre, metres taken off the path: float64 [3].
         timing: instants of the tangent and of slot 0, time from slot to slot (0: nothing moves): float64 [3].
         shape, edge: float32; of the weights, and distance from a scatterer to the first step's middle.
-        factors: float32 [2, CELLS], of ``lane_factors``.
+        factors: float32 [2, CELLS], constants of a step's cells: of the first step's weight, of its ratio to the next.
         legs: float32 [chips, LEG_PLANES * span], overwritten, span >= capacity * LANES: state at slot 0.
         turn: float32 [chips, 2 * span], overwritten: cosine and sine of the turn per slot.
         cell: float32 [2, chips, capacity], overwritten: middle of the group's cells less ``base``, change per second.
-        base: int32 [capacity], overwritten.
-        shortest, longest: float64 [capacity], overwritten: legs.
+        base, shortest, longest: as for ``transmit_legs``.
         path: float64 [2 * RX + 2, BLOCK], scratch, its rates 0 when nothing moves.
         cosines, work: float32 [RX, BLOCK] and [4, RX, BLOCK], scratch.
     """
@@ -341,6 +326,25 @@ def _turn_legs(size, span, legs, turn):  # type: ignore[no-untyped-def]
         legs[x], legs[x + span] = re * cosine - im * sine, re * sine + im * cosine
 
 
+@njit(inline="always")
+def _add(count, span, legs, plan, start, steps, lanes, imaginary, bend, begin, grid):  # type: ignore[no-untyped-def]
+    """Add all scatterers to one group's grid, ``steps`` times four cells each."""
+    for k in range(uint64(count)):
+        away, a, c, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
+        o, leg = begin + uint64(start[k]), k * lanes
+        for n in range(lanes):
+            x = leg + n
+            weight, step = _exp(away * legs[x + span + span]), ratio * legs[x + span + span + span]
+            cosine, sine = legs[x], legs[x + span]
+            re, im = (a * cosine - c * sine) * weight, (a * sine + c * cosine) * weight
+            for j in range(steps):
+                grid[o + lanes * j + n] += re
+                grid[o + imaginary + lanes * j + n] += im
+                re *= step
+                im *= step
+                step *= bend
+
+
 @cache
 def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[..., None]:
     """Kernel that adds scatterers to the grids of all groups.
@@ -387,23 +391,7 @@ def spreader(width: int, shape: float, plane: int, moving: bool) -> Callable[...
                     plan,
                     start,
                 )
-                for k in range(uint64(count)):
-                    away, a, c, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
-                    o, leg = begin + uint64(start[k]), k * lanes
-                    for n in range(lanes):
-                        x = leg + n
-                        weight, step = (
-                            _exp(away * leg_table[x + span + span]),
-                            ratio * leg_table[x + span + span + span],
-                        )
-                        cosine, sine = leg_table[x], leg_table[x + span]
-                        re, im = (a * cosine - c * sine) * weight, (a * sine + c * cosine) * weight
-                        for j in range(steps):
-                            grid[o + lanes * j + n] += re
-                            grid[o + imaginary + lanes * j + n] += im
-                            re *= step
-                            im *= step
-                            step *= bend
+                _add(count, span, leg_table, plan, start, steps, lanes, imaginary, bend, begin, grid)
                 if moving:
                     _turn_legs(uint64(count) * lanes, span, leg_table, turns)
                 begin += imaginary + imaginary

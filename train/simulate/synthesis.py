@@ -22,11 +22,11 @@ from edge.reference.point_targets import element_positions_m
 from edge.waveform import SPEED_OF_LIGHT_M_S
 from train.simulate.kernels_synthesis import (
     BLOCK,
+    CELLS,
     LANES,
     LEG_PLANES,
     RX,
     filter_amplitudes,
-    lane_factors,
     receive_legs,
     spreader,
     transmit_legs,
@@ -111,7 +111,8 @@ class Synthesizer:
 
     Args:
         radar: board, schedule, mounting; its calibration is not used.
-        width: grid cells to either side of a scatterer: 4 (error about -85 dB) or 6 (about -110 dB).
+        width: grid cells to either side of a scatterer: 4 (power of the error about -85 dB) or 6 (-105 dB and
+            less).
     Raises:
         ConfigError: width out of range, fewer than 64 samples, or receivers of one chip too far apart for this
             bandwidth.
@@ -145,7 +146,7 @@ class Synthesizer:
         self._spread = {moving: spreader(width, shape, plane, moving) for moving in (False, True)}
         self._transform = transformer(cells, layout.samples, MARGIN)
         self._twiddles, self._row_of = twiddles(cells), row_of_block(cells)
-        self._factors = lane_factors(shape, width)
+        self._factors = _lane_factors(shape, width)
         self._grid = zeros(chips * layout.slots * 2 * plane)
         self._columns = zeros(2 * cells * RX)
         self._signal = zeros((chips, layout.slots, layout.samples * RX), np.complex64)
@@ -339,6 +340,18 @@ class Synthesizer:
                 allowed=f"half paths of 0 to {self.reach_m:.3f} m",
                 action="leave scatterers beyond Synthesizer.reach_m out",
             )
+
+
+def _lane_factors(shape: float, width: int) -> NDArray[np.float32]:
+    """Constants of the four cells of a step: of the first step's weight, and of its ratio to the next [2, CELLS].
+
+    Args:
+        shape: of the weights exp(-shape distance^2).
+        width: cells to either side of a scatterer, even.
+    """
+    offset = np.arange(CELLS) - 0.5 * (CELLS - 1)
+    exponents = -shape * np.square(offset) + 2.0 * shape * (width - 2) * offset, -8.0 * shape * offset
+    return np.asarray(np.exp(np.stack(exponents)), dtype=np.float32)
 
 
 def _reorder(codes: Int16, layout: Layout, adc: Int16) -> None:
