@@ -22,12 +22,12 @@ from edge.bench.package_peers import MmwcorePeer
 from edge.bench.peer import Row, covered
 from edge.bench.report import document, lines, misses
 from edge.bench.startup import Start, resident_bytes, start
-from edge.bench.two_cores import TwoCores
 from edge.cli import main
 from edge.dsp.imager import Imager
 from edge.errors import DependencyError, ExitCode, RfconstructError
 from edge.frames import RADARS, RadarId
 from edge.rig import load_rig
+from edge.two_cores import TwoCores
 
 RIG = load_rig("cascade_demo")
 SCENE = Scene(RIG, 1)

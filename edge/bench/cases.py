@@ -12,7 +12,6 @@ import numpy as np
 from edge.bench.array_peers import NumpyPeer, ScipyPeer, ScipyRankPeer
 from edge.bench.package_peers import MmwcorePeer, OpenRadarPeer, OpenRadarRankPeer, XwrPeer
 from edge.bench.peer import Peer, covered
-from edge.bench.two_cores import TwoCores
 from edge.config import CFAR_KINDS, CfarKind, CfarSettings, DopplerChoice, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
@@ -21,6 +20,7 @@ from edge.frames import RADARS, Detections, Float64, Heatmap, PointCloud, RadarF
 from edge.fusion.association import Associator
 from edge.reference.point_targets import make_frame
 from edge.rig import Rig
+from edge.two_cores import TwoCores
 
 REFLECTORS = 24
 NOISE_LSB = 25.0

@@ -13,9 +13,9 @@ from edge.bench.cases import Case, Contender, Scene, stages, whole_frames
 from edge.bench.ceilings import Ceilings, Work, ceilings, heatmap_work, ring_work
 from edge.bench.measure import Timing, measure, processor
 from edge.bench.startup import start
-from edge.bench.two_cores import TwoCores
 from edge.frames import RADARS
 from edge.rig import Rig
+from edge.two_cores import TwoCores
 
 PACKAGES = ("numpy", "numba", "scipy")
 FRAME_SHARE = 0.75

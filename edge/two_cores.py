@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs one call in this thread and another in a second one; kernels release the GIL, so both cores work."""
+"""Runs one call in this thread and another in a second one; kernels release the GIL, so both cores work.
+
+A thread that spins for work instead of sleeping was tried and gains nothing: it must wait for the GIL all the same,
+which the first thread holds while it begins its own call.
+"""
 
 from __future__ import annotations
 
