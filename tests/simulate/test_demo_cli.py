@@ -341,6 +341,33 @@ def test_unplug_and_link(make: Make, tmp_path: Path) -> None:
         again.close()
 
 
+def test_cable_pulled_and_put_back(make: Make) -> None:
+    """The radar has its own supply: frames and state go on, no banner comes."""
+    faults = Faults()
+    radar, terminal, sink = make(faults, pace=1.0)
+    configure(terminal)
+    assert terminal.ask("sensorStart")[-1] == "Done"
+    faults.set("unplug", "vertical/cli", times=1)
+    os.write(terminal.handle, b"queryDemoStatus\n")
+    eventually(lambda: radar.port == "")
+    count = len(sink.frames)
+    radar.plug()
+    again = Terminal(radar.port)
+    try:
+        assert again.ask("queryDemoStatus")[0] == "Sensor State: 2"
+        eventually(lambda: len(sink.frames) > count)
+    finally:
+        again.close()
+
+
+def test_pyserial_reads_it(make: Make) -> None:
+    serial = pytest.importorskip("serial")
+    radar, _, _ = make()
+    with serial.Serial(radar.port, 115200, timeout=SAFETY_S) as port:
+        port.write(b"sensorStop\n")
+        assert port.read_until(PROMPT) == b"sensorStop\r\nIgnored: Sensor is already stopped\r\nDone\r\nmmwDemo:/>"
+
+
 def test_unplug_in_the_middle_of_the_frames(make: Make) -> None:
     faults = Faults()
     faults.set("unplug", "vertical/frames", skip=2, times=1)

@@ -114,7 +114,8 @@ def test_every_packet_of_the_notes_is_answered(make: Make) -> None:
         opcode, code, device, text_data = host.answer()
         assert (opcode, code, device) == (VERSION, 0x13, 32)
         assert text_data.decode().isprintable()
-    assert board.violations == []
+    assert all("before the master had its channels" in text for text in board.violations)
+    assert len(board.violations) == 3
 
 
 def test_golden_answers_bit_by_bit(make: Make) -> None:
@@ -406,6 +407,8 @@ def test_messages_that_are_refused(booted: tuple[Tda2Board, Host]) -> None:
     chirps = [(0x0101, struct.pack("<4HI4H", k, k, 0, 0, 0, 0, 0, 0, 1)) for k in range(9)]
     host.spi(1, h.rhcp(1, 8, host.sequence[1] % 16, chirps))
     assert host.read_answer(1).refusal is None, "nine chirps in one message"
+    host.spi(1, h.rhcp(1, 8, (host.sequence[1] + 1) % 16, [*chirps, chirps[0]]))
+    assert host.read_answer(1).kind == 2, "ten are more than 256 bytes"
 
 
 def test_order_of_the_configuration(booted: tuple[Tda2Board, Host]) -> None:
@@ -496,6 +499,55 @@ def test_start_order_and_running_frames(make: Make, tmp_path: Path) -> None:
     assert written[1:] == [0, 0, 0]
 
 
+def test_cascade_as_a_whole(make: Make) -> None:
+    """Chirp table, profiles, loops, period and trigger of the four chips must fit each other and the recorder."""
+    board = make()
+    with Host(board.address) as host:
+        h.connect(host)
+        for device in DEVICES:
+            h.boot(host, device)
+            h.configure(host, device, LOOPS, SAMPLES, 1)
+        host.good(8, 1, 8, 0x0101, struct.pack("<4HI4H", 0, 0, 0, 0, 0, 0, 0, 0, 3))
+        host.good(4, 1, 8, 0x0100, h.PROFILE_A[:40] + struct.pack("<HH", 40, 0))
+        host.good(2, 1, 8, 0x0102, h.frame(LOOPS + 1, SAMPLES, 1, 1))
+        host.good(2, 5, 0x206, 0x40C0, struct.pack("<IHH", 12 * (LOOPS + 1), 2 * SAMPLES, 0))
+        assert host.order(0x35, data=struct.pack("<I", 17), ack_type=0x10) == ACK
+        for device in (8, 4, 2, 1):
+            assert h.trigger(host, device, 1).refusal is None
+    for words in (
+        "chirp 0 fires TX [10, 11]",
+        "chip 2 has other profiles",
+        "chip 1 has other loops",
+        "slaves [1] run by software trigger",
+        "told 17 ms",
+        "before the recorder",
+    ):
+        assert any(words in text for text in board.violations), words
+    assert len(board.violations) == 6
+
+
+def test_slow_chips_answer_before_their_events(make: Make) -> None:
+    board = make(chip_delays=ChipDelays(2e-3, 2e-3, 2e-3, 1e-3, 0.0), create_s=2e-3, stop_s=2e-3)
+    with Host(board.address) as host:
+        h.connect(host)
+        assert host.order(0x21, 1, struct.pack("<I", 4)) == ACK
+        assert host.order(0x20, 1) == ACK
+        host.event(1, 0x5000)
+        h.load_firmware(host, 1)
+        host.good(1, 5, 0x200, 0x4000)
+        assert host.events == []
+        host.event(1, 0x5001)
+        assert host.order(0x20, 1) == ACK
+        host.sequence[1] = 0
+        host.event(1, 0x5000)
+        h.load_firmware(host, 1)
+        h.configure(host, 1, LOOPS, SAMPLES, 0)
+        for order, event in ((1, 0x100B), (0, 0x100F)):
+            assert h.trigger(host, 1, order).refusal is None
+            assert host.events == []
+            host.event(1, event)
+
+
 def test_other_size_than_configured_is_not_written(make: Make) -> None:
     board = make()
     with Host(board.address) as host:
@@ -555,6 +607,23 @@ def test_nacks_and_lost_answers(make: Make) -> None:
         host.socket.settimeout(0.3)
         with pytest.raises((AssertionError, TimeoutError)):
             host.receive()
+
+
+def test_hang_up_keeps_the_state(make: Make) -> None:
+    faults = Faults()
+    board = make(faults)
+    with Host(board.address) as host:
+        h.connect(host)
+        h.boot(host, 1)
+        faults.set("hang_up", "*/control", times=1)
+        host.send(h.packet(0x12, 32, 0x10))
+        with pytest.raises(ConnectionError):
+            host.answer()
+        sequence = dict(host.sequence)
+    with Host(board.address, sequence=sequence) as host:
+        assert host.order(0x35, data=bytes(4)) == NACK, "connect again"
+        h.connect(host)
+        host.good(1, 5, 0x202, 0x404C, bytes.fromhex("010000000000000000000000"))
 
 
 def test_chip_faults(make: Make) -> None:

@@ -107,7 +107,7 @@ class DemoRadar:
         self._pending = b""
         self._master, self._slave = -1, -1
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK)
-        self._pulled, self._reset_asked = False, False
+        self._pulled = self._reset_asked = self._lost_power = False
         self._thread = threading.Thread(target=self._run, name=f"{radar} cli", daemon=True)
         self._open()
 
@@ -164,6 +164,7 @@ class DemoRadar:
         with self._lock:
             self._end()
             self.firmware.reset()
+            self._lost_power = True
         self._pull()
         for _ in range(int(JOIN_S / 0.005)):
             if not self.port or threading.current_thread() is self._thread:
@@ -176,7 +177,9 @@ class DemoRadar:
             if not self.port:
                 self._pulled = False
                 self._open()
-                self._boot()
+                if self._lost_power:
+                    self._lost_power = False
+                    self._boot()
         self._wake()
 
     def pulse(self) -> None:

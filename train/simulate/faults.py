@@ -57,8 +57,10 @@ class Fault(StrEnum):
     """A receiver gives zeros; value: which one, from 0."""
     SATURATE = "saturate"
     """Samples at the rails; value: share of them."""
+    HANG_UP = "hang_up"
+    """TCP: the connection ends, the board keeps its state and runs on."""
     UNPLUG = "unplug"
-    """The connection ends: TCP closed, pseudo-terminal gone, UDP silent."""
+    """Power or cable gone: TCP closed and everything configured lost, UDP silent, pseudo-terminal gone."""
 
 
 _VALUES: dict[Fault, tuple[float, float, float]] = {

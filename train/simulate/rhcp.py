@@ -20,6 +20,7 @@ CHIP_SYNC = bytes.fromhex("badccdab")
 HEADER = struct.Struct("<6H")
 CRC_BYTES = 4
 LONGEST_MESSAGE = 256
+"""With the sync word."""
 FLAGS_CRC32 = 0x0400
 _RETRY_BITS = 0x0003
 
@@ -169,8 +170,8 @@ def parse_header(data: bytes) -> Message:
     if checksum(HEADER.unpack_from(body)[:5]) != check:
         raise BadMessageError(f"header checksum {check:04x}")
     header = Message(opcode & 15, opcode >> 4 & 3, opcode >> 6, flags >> 12, (), remaining, count)
-    if length != len(body) or length > LONGEST_MESSAGE or length % 4:
-        raise BadMessageError(f"length {length}, {len(body)} bytes were written, at most {LONGEST_MESSAGE}", header)
+    if length != len(body) or len(data) > LONGEST_MESSAGE or length % 4:
+        raise BadMessageError(f"length {length}, {len(body)} bytes after the sync word were written", header)
     if flags & 0x0FFF & ~_RETRY_BITS != FLAGS_CRC32:
         raise BadMessageError(f"flags {flags:04x}: CRC-32 and version 0 expected", header)
     if zlib.crc32(body[:-CRC_BYTES]) != int.from_bytes(body[-CRC_BYTES:], "little"):

@@ -18,8 +18,9 @@ from types import TracebackType
 from edge.errors import CaptureError
 from edge.frames import RadarFrame, RadarId
 from train.simulate.capture_writer import ROLL_OVER_BYTES
+from train.simulate.cascade_checks import start_notes
 from train.simulate.cascade_chip import CascadeChip, ChipDelays
-from train.simulate.chip_commands import MASTER
+from train.simulate.chip_commands import CHANNELS, MASTER
 from train.simulate.faults import Fault, Faults, FaultyChannel
 from train.simulate.frame_faults import FrameFaults
 from train.simulate.rhcp import CHIP_SYNC, READ_SYNC
@@ -214,6 +215,9 @@ class Tda2Board:
     def _handle(self, packet: Packet) -> None:
         self.log.append((packet.opcode, packet.device))
         where = f"{self.radar}/control"
+        if self.faults is not None and self.faults.hit(Fault.HANG_UP, where):
+            self._server.hang_up()
+            return
         forced = self.faults is not None and self.faults.hit(Fault.NACK, where, packet.opcode)
         try:
             if packet.fault:
@@ -258,6 +262,8 @@ class Tda2Board:
 
     def restart_chip(self, number: int) -> None:
         """The reset line of a chip; what was being read from it is gone."""
+        if number and CHANNELS not in self.chips[0].settings:
+            self.complain(f"chip {number} was reset before the master had its channels: slaves live on its clock")
         self._lines[number], self._reading[number] = False, b""
         self.chips[number].reset()
 
@@ -309,17 +315,8 @@ class Tda2Board:
         if not chip.running:
             self._halt_bursts()
             return
-        waiting = [slave.number for slave in self.chips[1:] if slave.number in self.mapped and not slave.running]
-        if waiting:
-            self.complain(f"master started before slaves {waiting}: they miss its frames")
-        free = [c.number for c in self.chips[1:] if c.running and c.frame is not None and c.frame.trigger == MASTER]
-        if free:
-            self.complain(f"slaves {free} run by software trigger: their frames are not the master's")
-        told_ms = self.recorder.settings.period_ms
-        if chip.frame is not None and told_ms is not None and told_ms != int(chip.frame.period * FRAME_LSB_NS * 1e-6):
-            self.complain(f"recorder was told {told_ms} ms, frames come every {chip.frame.period * 5e-6:g} ms")
-        if not self.recorder.recording:
-            self.complain("frames were started before the recorder")
+        for note in start_notes([own for own in self.chips if own.number in self.mapped], self.recorder):
+            self.complain(note)
         frame = chip.frame
         assert frame is not None, "frames start only with a frame command"
         if self.first_number is not None:
