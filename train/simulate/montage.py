@@ -29,7 +29,7 @@ MARGIN_M = 0.6
 TRUTH_POINTS = 4000
 TRUTH = "#c3c8cf"
 DPI = 85
-SPAN_DB = 35.0
+SPAN_DB = 25.0
 AROUND_M = 3.0
 """Heatmaps are drawn this far beyond the object."""
 
@@ -112,7 +112,7 @@ def _caption(made: SimulatedCloud) -> str:
     return (
         f"{scene.side_m:.1f} m aside, {scene.neighbours} neighbours; {made.frames} frames over {made.travel_m:.1f} m; "
         f"{100 * figures.within_10cm:.0f} % of the points within 10 cm of the true surface (grey), "
-        f"{100 * figures.within_20cm:.0f} % within 20 cm"
+        f"{100 * figures.within_20cm:.0f} % within 20 cm; the cluster is {made.status}"
     )
 
 
