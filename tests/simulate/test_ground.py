@@ -13,10 +13,13 @@ from edge.dsp.antenna import across_loss_db, along_loss_db
 from edge.errors import ConfigError
 from edge.frames import RADARS, Float64, RadarId
 from tests.simulate.plain_surfaces import EVERYTHING, NO_GROUND, OPEN, WAVELENGTH_M, point_surface
+from train.objects.mesh import Mesh
+from train.objects.primitives import box, join
 from train.simulate.ground import GroundSettings, ground_reflection
 from train.simulate.link_budget import LinkSettings, amplitude_per_rcs
 from train.simulate.optics import OpticsSettings, Placed, SceneOptics
 from train.simulate.scatterers import GroundPlane, Scatterers
+from train.simulate.surface import SurfaceSettings, make_surface
 
 LOOK_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 STILL = np.zeros(3)
@@ -52,14 +55,17 @@ def test_fresnel_coefficients() -> None:
 
 
 @pytest.mark.parametrize("radar", RADARS)
-def test_two_ray_pattern_over_height(radar: RadarId) -> None:
-    """|R_d^-1 + Gamma R_g^-1 e^(j Delta)|^4 R_d^4 over a point without ground, 0.3 to 1.5 m high."""
+@pytest.mark.parametrize("pitch_deg", [0.0, 7.0])
+def test_two_ray_pattern_over_height(radar: RadarId, pitch_deg: float) -> None:
+    """|R_d^-1 + Gamma R_g^-1 e^(j Delta)|^4 R_d^4 over a point without ground, 0.3 to 1.5 m high; tilted rig too."""
+    c, s = np.cos(np.radians(pitch_deg)), np.sin(np.radians(pitch_deg))
+    attitude = LOOK_LEFT @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
     ground = GroundSettings(permittivity=4.0, roughness_m=5e-4, horizontal_board="V")
     polarization = "V" if radar == "horizontal" else "H"
     height_m, away_m = 0.8, 6.0
     for point_m in np.linspace(0.3, 1.5, 25):
         placed = [Placed(point_surface((0.0, 0.0, float(point_m)), 1.0), np.array([0.0, away_m, 0.0]))]
-        arguments = (radar, 0.0, np.array([0.0, 0.0, height_m]), LOOK_LEFT, STILL, REACH_M)
+        arguments = (radar, 0.0, np.array([0.0, 0.0, height_m]), attitude, STILL, REACH_M)
         over, plane = optics(placed, mirror(ground)).scatterers(*arguments)
         alone, _ = optics(placed, replace(EVERYTHING, ground=NO_GROUND)).scatterers(*arguments)
         assert (len(over), len(alone)) == (4, 1)
@@ -129,16 +135,22 @@ def test_clutter_is_fixed_to_the_world_and_has_its_mean_level() -> None:
 
 
 def test_every_burst_is_a_function_of_place_and_time_alone() -> None:
-    placed = [Placed(point_surface((0.1, 0.0, z), 1.0), np.array([0.3, 4.0 + z, 0.0]), 0.2) for z in (0.3, 0.9)]
-    places = [np.array([x, 0.0, 0.8]) for x in np.linspace(0.0, 0.5, 12)]
+    """Two boxes, one of which drives past in front of the other: in order, and each burst by a new object alone."""
+    mesh = Mesh(*join([box((0, 0, 0.5), (1.6, 0.6, 1.0))]), 0, "test/box")
+    surface = make_surface(mesh, SurfaceSettings(), 3.0, WAVELENGTH_M, np.random.default_rng(0))
+    placed = [
+        Placed(surface, np.array([0.3, 5.0, 0.0]), 0.2),
+        Placed(surface, np.array([-1.0, 3.0, 0.0]), 0.0, np.array([1.5, 0.0, 0.0])),
+    ]
     made = optics(placed, OpticsSettings())
-    first = [made.scatterers("vertical", 0.0, p, LOOK_LEFT, STILL, REACH_M)[0] for p in places]
-    for number in (7, 2, 11, 0):
-        again = optics(placed, OpticsSettings()).scatterers("vertical", 0.0, places[number], LOOK_LEFT, STILL, REACH_M)[
-            0
-        ]
-        assert again.amplitude.tobytes() == first[number].amplitude.tobytes()
-        assert again.position_m.tobytes() == first[number].position_m.tobytes()
+    bursts = [(RADARS[n % 2], 0.05 * n, np.array([0.03 * n, 0.0, 0.8]), LOOK_LEFT, STILL, REACH_M) for n in range(24)]
+    first = [made.scatterers(*burst)[0] for burst in bursts]
+    assert len({len(found) for found in first}) > 8
+    for number in (19, 2, 23, 0, 11, 10):
+        for again in (made, optics(placed, OpticsSettings())):
+            found, _ = again.scatterers(*bursts[number])
+            assert found.amplitude.tobytes() == first[number].amplitude.tobytes()
+            assert found.position_m.tobytes() == first[number].position_m.tobytes()
 
 
 def test_what_is_too_far_or_behind_is_left_out() -> None:

@@ -99,6 +99,10 @@ def strongest(entries: Entries, most: int, least: float) -> Entries:
     )
 
 
+NEVER = np.float32(1e6)
+"""Least cosine of patches so rough that nothing of them is coherent."""
+
+
 class Weigher:
     """Amplitudes of patches and points; owns the buffers.
 
@@ -129,6 +133,7 @@ class Weigher:
         facing[:3], facing[3:6] = patches.shape[:, 0].T, patches.shape[:, 1].T
         least = np.where(patches.spread > CURVED_FROM * lobe, curved_cosine, flat_cosine)
         facing[6] = np.maximum(least, np.cos(np.radians(self._settings.lobe_most_deg)))
+        facing[6, patches.roughness * np.square(facing[6]) > MOST_EXPONENT] = NEVER
         return facing
 
     def candidates(self, number: int, eye_m: Float64, step_m: float) -> Int32:
