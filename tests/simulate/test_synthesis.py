@@ -88,16 +88,16 @@ def test_the_largest_error_of_any_sample_is_75_db_below_the_largest_sample() -> 
     assert 20 * np.log10(abs(Synthesizer(radar).beat(points) - expected).max() / abs(expected).max()) < -75
 
 
-@pytest.mark.parametrize("speed_m_s", [0.5, 10.0])
-def test_motion_and_ground_paths_chirp_by_chirp(speed_m_s: float) -> None:
-    radar = cascade("vertical", loops=3)
-    points = scene(40, 11.0, speed_m_s, images=True)
+@pytest.mark.parametrize(("speed_m_s", "loops"), [(0.5, 8), (1.5, 8), (10.0, 3)])
+def test_motion_and_ground_paths_chirp_by_chirp(speed_m_s: float, loops: int) -> None:
+    radar = cascade("vertical", loops=loops)
+    points = scene(20, 11.0, speed_m_s, images=True)
     assert {(bool(a), bool(b)) for a, b in zip(points.tx_image, points.rx_image, strict=True)} == {
         (a, b) for a in (False, True) for b in (False, True)
     }
     expected = direct_sum(radar, points, GROUND)
     assert error_db(Synthesizer(radar).beat(points, GROUND), expected) < -80
-    assert error_db(Synthesizer(radar, 6).beat(points, GROUND), expected) < -100
+    assert error_db(Synthesizer(radar, 6).beat(points, GROUND), expected) < -95
 
 
 def test_the_oracle_places_the_antennas_where_the_pipeline_does() -> None:

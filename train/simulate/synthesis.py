@@ -46,6 +46,8 @@ FEWEST_SAMPLES = 64
 MARGIN = 16
 """Grid rows before the cell of range 0."""
 FIRST_ROOM = 1024
+BOW_M = 4e-6
+"""Path by which a burst may bow out of one tangent; all receivers share it but for a few percent."""
 APART = 80
 """Floats between the planes of the legs, so that they do not compete for the same lines of the cache."""
 
@@ -155,7 +157,7 @@ class Synthesizer:
         self._correction = np.repeat(inverse, RX).astype(np.float32)
         self._unfiltered = self._response = np.ones(cells + 1, dtype=np.complex64)
         self._filtered_by: FrontEnd | None = None
-        self._moving, self._slot_s = False, profile.chirp_time_s
+        self._moving, self._tangents, self._slot_s = False, 1, profile.chirp_time_s
         self._path, self._scratch = zeros((2 * RX + 2, BLOCK), np.float64), zeros((4, RX, BLOCK))
         self._cosines = zeros((RX, BLOCK))
         self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
@@ -266,52 +268,44 @@ class Synthesizer:
             work.amplitude,
         )
         work.bend[:k] = 0.0
-        self._moving = bool(scatterers.velocity_m_s.any())
         self._path[:] = 0.0
+        self._moving, self._tangents = bool(scatterers.velocity_m_s.any()), 1
         if self._moving:
             away_m = work.points[1, :, :k] - self._centre_m[:, None]
             range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
             velocity = work.velocity[1, :, :k]
             radial = (velocity * away_m).sum(axis=0) / range_m
-            work.bend[:k] = 0.5 * (np.square(velocity).sum(axis=0) - np.square(radial)) / range_m
+            speed2 = np.square(velocity).sum(axis=0)
+            work.bend[:k] = 0.5 * (speed2 - np.square(radial)) / range_m
+            half_s = 0.5 * self._layout.loops * self._layout.slots * self._slot_s
+            if float((speed2 / range_m).max()) * half_s**2 > BOW_M:
+                self._tangents = self._layout.loops
 
     def _grid_loop(self, k: int, loop: int, jitter_s: Float64 | None) -> None:
-        """Spread the scatterers as one loop sees them."""
-        work, slots = self._work, self._layout.slots
+        """Spread the scatterers as one loop sees them; loops come in order.
+
+        The receive legs are tangents of every loop, or of the whole burst when no path bows far from its own.
+        """
+        work, layout = self._work, self._layout
+        slots, first = layout.slots, loop if self._tangents > 1 else 0
         time_s = (loop * slots + np.arange(slots)) * self._slot_s
-        middle_s = float(time_s.mean())
+        middle_s = (first * slots + 0.5 * (slots * (1 if self._tangents > 1 else layout.loops) - 1)) * self._slot_s
         out_scale = np.zeros(2 + slots)
         out_scale[:2] = self._cells_per_m, self._turns_per_m
         if jitter_s is not None:
             out_scale[2:] = jitter_s * self._jitter_turns_per_m_s
         transmit_legs(
             *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
-            *(
-                out_scale,
-                work.re,
-                work.im,
-                work.cell_out,
-                work.base_out,
-                work.reach_out[0],
-                work.reach_out[1],
-                self._path[:1],
-            ),
+            *(out_scale, work.re, work.im, work.cell_out, work.base_out, *work.reach_out, self._path[:1]),
         )
-        timing = np.array([middle_s, time_s[0], self._slot_s if self._moving else 0.0])
-        scale = np.array([self._cells_per_m, self._turns_per_m, self._offset_m])
-        receive_legs(
-            *(k, work.points[1], work.velocity[1], self._receivers_m, scale, timing),
-            *(np.float32(SHAPES[self.width]), np.float32(self.width - 2), self._factors, work.legs, work.turn),
-            *(
-                work.cell_back,
-                work.base_back,
-                work.reach_back[0],
-                work.reach_back[1],
-                self._path,
-                self._cosines,
-                self._scratch,
-            ),
-        )
+        if loop == first:
+            timing = np.array([middle_s, time_s[0], self._slot_s if self._moving else 0.0])
+            receive_legs(
+                *(k, work.points[1], work.velocity[1], self._receivers_m),
+                *(np.array([self._cells_per_m, self._turns_per_m, self._offset_m]), timing),
+                *(np.float32(SHAPES[self.width]), np.float32(self.width - 2), self._factors, work.legs, work.turn),
+                *(work.cell_back, work.base_back, *work.reach_back, self._path, self._cosines, self._scratch),
+            )
         self._require_reach(k)
         self._grid[:] = 0.0
         work.base[:k] = work.base_out[:k] + work.base_back[:k] + MARGIN
