@@ -83,18 +83,18 @@ def _read_source(
     from train.simulate.simulator_source import SimulatorSource
 
     source = SimulatorSource(rig, supply, None, poses, pace=options.pace, faults=faults)
-    frames, start_s, cpu_s = 0, 0.0, 0.0
+    frames, first_s, last_s, cpu_s = 0, 0.0, 0.0, 0.0
     with _interrupts() as stop:
         for item in source:
-            if not start_s:
-                start_s, cpu_s = time.monotonic(), time.process_time()
-            frames += isinstance(item, RadarFrame)
-            if stop.is_set() or time.monotonic() - start_s >= (options.seconds or float("inf")):
-                break
-    taken_s, cpu_s = time.monotonic() - start_s, time.process_time() - cpu_s
+            if isinstance(item, RadarFrame):
+                frames, last_s = frames + 1, time.monotonic()
+                if frames == 1:
+                    first_s, cpu_s = last_s, time.process_time()
+                if stop.is_set() or last_s - first_s >= (options.seconds or float("inf")):
+                    break
+    load, taken_s = time.process_time() - cpu_s, max(last_s - first_s, 1e-9)
     source.close()
-    rate_hz, load = frames / taken_s, 100 * cpu_s / taken_s
-    print(f"{frames} frames in {taken_s:.2f} s: {rate_hz:.1f} a second, {load:.0f} % of one core")
+    print(f"{frames} frames, {(frames - 1) / taken_s:.1f} a second, {100 * load / taken_s:.0f} % of one core")
     print(f"late because they were not made in time: {source.late.total()}; asked for late: {source.slow_reads}")
     return int(ExitCode.DEGRADED if source.late else ExitCode.OK)
 
