@@ -24,6 +24,8 @@ from train.simulate.weights import Entries, Weigher, join, strongest
 REACH_MARGIN_M = 0.3
 """Between the longest half path from the rig's origin and that from any antenna during the burst."""
 CLUTTER_IMBALANCE_DB = 2.0
+MOVER_STEPS = 3
+"""A moving object hides others as from the nearest point of a grid this many times as wide as its own."""
 _BLIND = Sight(np.empty(0, np.int32), np.empty(0, np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
 
 
@@ -134,7 +136,10 @@ class SceneOptics:
         step_m = self._settings.visibility_step_m
         origin = np.append(step_m * np.rint(position_m[:2] / step_m), position_m[2])
         views = self._views(now, position_m, step_m)
-        changed = self._look(views, origin)
+        coarse = self._views(now, position_m, MOVER_STEPS * step_m)
+        moving = [bool(np.any(one.velocity_m_s)) for one in now]
+        as_hiders = [far if moves else near for near, far, moves in zip(views, coarse, moving, strict=True)]
+        changed = self._look(views, as_hiders, origin)
         near = self._views(now, position_m, self._settings.weight_step_m)
         for number, view in enumerate(near):
             eye = view.in_object_m
@@ -146,23 +151,24 @@ class SceneOptics:
             self._entries = self._gather(origin)
             self._clutter_origin_m, self._clutter_from = origin, origin.tobytes()
 
-    def _look(self, views: Sequence[View], origin_m: Float64) -> set[int]:
+    def _look(self, views: Sequence[View], as_hiders: Sequence[View], origin_m: Float64) -> set[int]:
         """Make new pictures where an object, or one that may hide it, or the ground's points have moved."""
-        whole = b"".join([origin_m.tobytes(), *(view.eye_m.tobytes() for view in views)])
+        whole = b"".join([origin_m.tobytes(), *(view.eye_m.tobytes() for view in (*views, *as_hiders))])
         if whole == self._looked_from:
             return set()
         self._looked_from = whole
         changed, around = set(), self._clutter.around(origin_m)
         for number, view in enumerate(views):
-            hiders = self._visibility.hiders(number, views)
+            others = [view if n == number else hider for n, hider in enumerate(as_hiders)]
+            hiders = self._visibility.hiders(number, others)
             key = b"".join(
-                [origin_m.tobytes(), *(views[n].eye_m.tobytes() + bytes([n % 256]) for n in (number, *hiders))]
+                [origin_m.tobytes(), *(others[n].eye_m.tobytes() + bytes([n % 256]) for n in (number, *hiders))]
             )
             if key == self._seen_from[number]:
                 continue
             candidates = self._weigher.candidates(number, view.in_object_m, self._settings.visibility_step_m)
             ground = self._settings.ground.enabled
-            self._sights[number] = self._visibility.look(number, views, hiders, ground, candidates, around)
+            self._sights[number] = self._visibility.look(number, others, hiders, ground, candidates, around)
             self._seen_from[number] = key
             changed.add(number)
         return changed

@@ -20,7 +20,8 @@ class OpticsSettings:
         keep_db: entries weaker by more than the object's strongest are left out.
         floor_db: entries weaker than the noise of one sample by more are left out (a frame integrates 43 dB).
         max_scatterers: strongest kept of all objects, clutter not counted.
-        lobe_end: sqrt(q_t^2 A) beyond which a flat patch sends nothing: 20 is 16 degrees off for patches of 3 cm.
+        lobe_end: sqrt(q_t^2 A) beyond which a flat patch sends nothing: 14 is 10 degrees off for patches of 3.5 cm,
+            where the lobe is 30 dB down.
         lobe_most_deg: angle off the normal beyond which no patch sends anything.
         ground: ground paths and clutter.
     """
@@ -31,7 +32,7 @@ class OpticsSettings:
     keep_db: float = 30.0
     floor_db: float = -40.0
     max_scatterers: int = 1500
-    lobe_end: float = 20.0
+    lobe_end: float = 14.0
     lobe_most_deg: float = 25.0
     ground: GroundSettings = field(default_factory=GroundSettings)
 
