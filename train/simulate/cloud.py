@@ -147,11 +147,12 @@ def simulate_cloud(spec: DriveSpec) -> SimulatedCloud:
 
 def make_drive(spec: DriveSpec, mesh: Mesh) -> DriveBy:
     """The drive-by of a spec; ``mesh`` is that of its object. The target is the first of its objects."""
-    settings = draw(spec.ranges, spec.seed)
+    base = _rig(spec.rig)
+    schedule = next(iter(base.radars.values())).schedule
+    settings = draw(spec.ranges, spec.seed, schedule.frame_period_s)
     settings = replace(settings, track=replace(settings.track, every=min(spec.every, settings.track.frames)))
-    rig = settings.processing.applied(_rig(spec.rig))
-    schedule = next(iter(rig.radars.values())).schedule
-    duration_s = settings.track.frames * (settings.track.frame_period_s or schedule.frame_period_s)
+    rig = settings.processing.applied(base)
+    duration_s = settings.track.frames * schedule.frame_period_s
     placed = make_scene(
         *(mesh, settings.scene, settings.surface, settings.track.speed_m_s * duration_s, duration_s),
         *(float(schedule.profile.wavelength_m), spec.seed),

@@ -140,11 +140,17 @@ class _Draw:
         return int(self._rng(name).integers(len(getattr(self._ranges, name))))
 
 
-def draw(ranges: Ranges, seed: int) -> SimulationSettings:
-    """Settings of the drive-by number ``seed``; the same on every machine."""
+def draw(ranges: Ranges, seed: int, frame_period_s: float = FRAME_PERIOD_S) -> SimulationSettings:
+    """Settings of the drive-by number ``seed``; the same on every machine.
+
+    Args:
+        ranges: what to draw from.
+        seed: of every value.
+        frame_period_s: of the rig's schedule; the speed follows from it.
+    """
     take = _Draw(ranges, seed)
     return SimulationSettings(
-        track=_track(take, ranges),
+        track=_track(take, ranges, frame_period_s),
         scene=SceneSettings(
             side_m=take.uniform("side_m"),
             along_m=take.uniform("along_m"),
@@ -192,9 +198,9 @@ def draw(ranges: Ranges, seed: int) -> SimulationSettings:
     )
 
 
-def _track(take: _Draw, ranges: Ranges) -> TrackSettings:
+def _track(take: _Draw, ranges: Ranges, frame_period_s: float) -> TrackSettings:
     frames = take.whole("frames")
-    speed_m_s = take.uniform("travel_m") / (frames * FRAME_PERIOD_S)
+    speed_m_s = take.uniform("travel_m") / (frames * frame_period_s)
     return TrackSettings(
         frames=frames,
         speed_m_s=float(np.clip(speed_m_s, *ranges.speed_m_s)),
