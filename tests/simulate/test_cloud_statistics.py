@@ -35,8 +35,8 @@ def test_known_distances_shares_and_coverage(cuboid: Mesh) -> None:
     rng = np.random.default_rng(1)
     x, z = np.meshgrid(np.arange(-0.95, 0.0, 0.1), np.arange(0.05, 1.0, 0.1))
     near = np.column_stack((x.ravel(), np.full(x.size, -0.5), z.ravel()))
-    far = near + [0.0, -0.15, 0.0]
-    wrong = near + [0.0, -1.0, 0.0]
+    far = near + np.array([0.0, -0.15, 0.0])
+    wrong = near + np.array([0.0, -1.0, 0.0])
     cloud = np.concatenate((near, far, wrong)).astype(np.float32)
     frame = np.arange(len(cloud)) % 60
     figures = measure(cuboid, cloud, frame, 80, [FRONT[1]], rng)
