@@ -58,8 +58,8 @@ def test_a_failing_item_gets_a_second_try_and_is_then_reported(tmp_path: Path) -
 
 
 def test_an_item_that_hangs_is_stopped() -> None:
-    answers = dict(LocalPool(1, limit_s=2.0).run(stuck, [1, 0, 2]))
-    assert answers == {1: 1, 0: Failure("stopped after 2 s"), 2: 2}
+    answers = dict(LocalPool(1, limit_s=1.0).run(stuck, [1, 0, 2]))
+    assert answers == {1: 1, 0: Failure("stopped after 1 s"), 2: 2}
 
 
 def test_workers_have_one_thread_and_the_caller_keeps_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
