@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge.errors import ConfigError
 from edge.frames import Float64, FusedCloud, ObjectCloud, Pose
 from edge.odometry.transforms import rotation_matrix
 from edge.pipeline import Pipeline, WindowResult
@@ -155,3 +156,12 @@ def test_frames_of_an_objects_points_are_found_in_the_window(drive: DriveBy) -> 
     local = (xyz_m[member].astype(float) @ axes.T + window.reference.position_m - origin_m).astype(np.float32)
     cloud = replace(cloud_at(origin_m, 3, window), xyz_m=local)
     assert (frame_numbers(window, cloud) == window.frame_number[member]).all()
+
+
+def test_a_rig_that_cannot_see_the_scene_is_refused(drive: DriveBy) -> None:
+    with pytest.raises(ConfigError, match="radars of rig corridor"):
+        simulate_cloud(DriveSpec(CAR, 1, EASY, rig="corridor"))
+    drive_right = make_drive(DriveSpec(CAR, 11, EASY), CAR.mesh())
+    drive_right.rig = replace(drive.rig, geometry=replace(drive.rig.geometry, yaw_deg=-90.0))
+    with pytest.raises(ConfigError, match="yaw_deg"):
+        run(drive_right, [])

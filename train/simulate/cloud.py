@@ -133,13 +133,11 @@ def simulate_cloud(spec: DriveSpec) -> SimulatedCloud:
     """Drive past the object and return its cloud; the same spec gives the same cloud.
 
     Raises:
-        ConfigError: no such rig, a rig of one radar (it sees no height), or ranges that cannot work.
+        ConfigError: no such rig, one that ``run`` refuses, or ranges that cannot work.
         MeshError: no such object.
     """
     mesh = spec.object.mesh()
     drive = make_drive(spec, mesh)
-    radars = drive.rig.radars
-    require(len(radars) == len(RADARS), f"radars of rig {spec.rig}", ", ".join(radars), " and ".join(RADARS))
     windows = Windows()
     run(drive, [windows])
     return observe(spec, mesh, drive, windows.results)
@@ -161,7 +159,14 @@ def make_drive(spec: DriveSpec, mesh: Mesh) -> DriveBy:
 
 
 def run(drive: DriveBy, sinks: Sequence[Sink]) -> Pipeline:
-    """Everything that a drive-by gives through the whole pipeline; its stages are shared with the next drive-by."""
+    """Everything that a drive-by gives through the whole pipeline; its stages are shared with the next drive-by.
+
+    Raises:
+        ConfigError: a rig of one radar, which sees no height, or one that does not look to the left of the vehicle.
+    """
+    name, radars, yaw_deg = drive.rig.name, drive.rig.radars, drive.rig.geometry.yaw_deg
+    require(len(radars) == len(RADARS), f"radars of rig {name}", ", ".join(radars), " and ".join(RADARS))
+    require(30 <= yaw_deg % 360 <= 150, f"geometry.yaw_deg of rig {name}", yaw_deg, "30..150, the scenes stand left")
     pipeline = Pipeline(drive.rig, None, sinks, shared_stages().imaging(drive.rig))
     for item in drive:
         pipeline.feed(item)
