@@ -17,6 +17,7 @@ import numpy as np
 from edge.config import HeatmapSettings
 from edge.dsp import tables, tdm
 from edge.dsp.beam_weights import BeamWeights, sector_closing_m_s
+from edge.dsp.buffers import zeros
 from edge.dsp.kernels_doppler import FINE, FRACTIONS, ROUNDS, SPREAD_SHAPE, TAPS, plan_spreading, set_turns, spread
 from edge.dsp.kernels_heatmap import angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
@@ -30,7 +31,7 @@ MARGIN = TAPS + 2
 DENSITY_REACH = 4
 DENSITY_SHARE = 0.75
 """Density counts by sinc^2(0.75 x), whose spectrum ends at 3/4 of the grid's period: the field of view."""
-ANGLE_LANES = 32
+ANGLE_LANES = 64
 STILL_CELLS = 0.02
 """Elements that move by less stay on the grid, which is exact in every direction."""
 
@@ -86,15 +87,15 @@ class Steering:
         one_s = one_s - 0.5 * (one_s.min() + one_s.max())
         self._beam_weights = BeamWeights(self._position, one_s, window, geometry.pitch, wavelength_m)
         self._first = np.zeros((loops, len(self._slot)), dtype=np.int64)
-        self._taps = np.zeros((loops, len(self._slot), TAPS), dtype=np.float32)
+        self._taps = zeros((loops, len(self._slot), TAPS))
         self._centred_s = np.zeros((loops, slots))
         self._turn = np.zeros((loops, slots), dtype=np.complex64)
-        self._line = np.zeros((2, points), dtype=np.float32)
-        self._rows = [np.zeros((2, cells, points), dtype=np.float32) for cells in (bins // 2, bins)]
+        self._line = zeros((2, points))
+        self._rows = [zeros((2, cells, points)) for cells in (bins // 2, bins)]
         self._angle_kernels = [angle_kernel(bins, points, ANGLE_LANES, whole) for whole in (False, True)]
         self._twiddle = tables.twiddles(bins, +1, 0)
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
-        self._work = np.zeros(2 * bins * ANGLE_LANES, dtype=np.float32)
+        self._work = zeros(2 * bins * ANGLE_LANES)
 
     def loops_that_fit(self, forward_m_s: float, along_m_s: float, most: int) -> int:
         """Loops whose moved elements stay within the angle FFT's length."""
