@@ -23,7 +23,8 @@ class Timing:
     """Of one call.
 
     Args:
-        median_ms, p99_ms: CPU time of the calling thread over all repetitions: other processes do not count.
+        median_ms: CPU time of the calling thread over all repetitions: other processes do not count.
+        p99_ms: the same without the first repetitions of the bursts, unless a call is so slow that it has no others.
         after_others_ms: median of the first repetitions of a burst, when other calls have just used the caches.
         wall_ms, wall_p99_ms: the same by the wall clock.
         repetitions: how many.
@@ -82,7 +83,9 @@ def _burst(call: Callable[[], object]) -> list[tuple[int, int]]:
 
 def _timing(bursts: list[list[tuple[int, int]]]) -> Timing:
     ms = np.array([one for burst in bursts for one in burst]) / 1e6
-    (cpu_ms, wall_ms), (cpu_p99_ms, wall_p99_ms) = np.median(ms, axis=0), np.percentile(ms, 99, axis=0)
+    repeated = [one for burst in bursts for one in burst[1:]]
+    cpu_ms, wall_ms = np.median(ms, axis=0)
+    cpu_p99_ms, wall_p99_ms = np.percentile(np.array(repeated) / 1e6 if repeated else ms, 99, axis=0)
     first_ms = np.median([burst[0][0] for burst in bursts]) / 1e6
     return Timing(
         float(cpu_ms), float(cpu_p99_ms), float(first_ms), float(wall_ms), float(wall_p99_ms), repetitions=len(ms)

@@ -98,7 +98,7 @@ def _frames(frames: list[Result]) -> Iterator[str]:
     yield (
         "Times are CPU time of the thread, so that other processes of a shared machine do not count; those of two "
         "cores are by the wall clock. *After others*: first repetitions of the bursts, when another call has just "
-        "filled the caches. *Wall*: median by the wall clock."
+        "filled the caches; p99 is that of all other repetitions. *Wall*: median by the wall clock."
     )
     yield ""
 

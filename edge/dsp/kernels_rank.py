@@ -33,8 +33,9 @@ def _pad(power, pattern, first, train_angle, train, padded):  # type: ignore[no-
         for d in range(ranges - first):
             padded[train_angle + a, begin + uint64(train + d)] = power[a, begin + uint64(d)] * pattern[a]
     for t in range(train_angle):
-        padded[t] = padded[angles + t]
-        padded[angles + train_angle + t] = padded[train_angle + t]
+        for d in range(padded.shape[1]):  # a copy of a row as a whole would compile a second for its error message
+            padded[t, d] = padded[angles + t, d]
+            padded[angles + train_angle + t, d] = padded[train_angle + t, d]
 
 
 @njit(inline="always")

@@ -55,8 +55,10 @@ def level_lobes(rows, wanted, beyond, main_lobe, ridge, level, rounds, normal, w
         The maximum.
     """
     points, n = len(wanted), rows.shape[1]
-    emphasis = np.where(beyond, 1.0, main_lobe)
-    lowest, error = 1e30, np.zeros(points)
+    emphasis, error = np.empty(points), np.zeros(points)
+    for p in range(points):
+        emphasis[p] = 1.0 if beyond[p] else main_lobe
+    lowest = 1e30
     best, w = weight[0], weight[1]
     for _ in range(rounds):
         normal[:] = 0.0
@@ -85,7 +87,8 @@ def level_lobes(rows, wanted, beyond, main_lobe, ridge, level, rounds, normal, w
             largest = max(largest, error[p]) if beyond[p] else largest
         if largest < lowest:
             lowest = largest
-            best[:] = w
+            for i in range(n):  # a copy of a slice would compile a second for its error message
+                best[i] = w[i]
         if largest <= level:
             break
         mean, count = 0.0, 0
