@@ -230,7 +230,7 @@ class ObjectSettings:
         forget_s: an identity unseen for longer is retired.
     """
 
-    neighbour_m: float = 0.6
+    neighbour_m: float = 0.8
     core_points: int = 4
     min_points: int = 24
     ground_clearance_m: float = 0.15

@@ -160,7 +160,7 @@ def test_ground_clutter_does_not_merge_objects_and_joins_the_nearest() -> None:
         middle_y = 0.0 if low[:, 1].mean() < 1.4 else 2.8
         reach = np.abs(low[:, :2] - [8.0, middle_y]) - [2.0, 0.9]
         assert len(low) > 500
-        assert np.hypot(*np.maximum(reach, 0).T).max() <= 0.6 + 1e-5
+        assert np.hypot(*np.maximum(reach, 0).T).max() <= ObjectSettings().neighbour_m + 1e-5
         assert ((low[:, 1] - 1.4) * (middle_y - 1.4) > 0).all()
     report = seg.last_report
     assert report.loose > 0
