@@ -27,7 +27,7 @@ class OpticsSettings:
     """
 
     visibility_step_m: float = 0.10
-    weight_step_m: float = 0.04
+    weight_step_m: float = 0.06
     picture: tuple[int, int] = (320, 160)
     keep_db: float = 30.0
     floor_db: float = -40.0

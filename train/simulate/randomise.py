@@ -60,8 +60,8 @@ class Ranges:
     side_m: Range = (3.0, 10.0)
     along_m: Range = (-0.7, 0.7)
     yaw_deg: Range = (0.0, 360.0)
-    neighbours: tuple[int, int] = (0, 3)
-    gap_m: Range = (0.7, 1.5)
+    neighbours: tuple[int, int] = (0, 2)
+    gap_m: Range = (0.8, 2.5)
     wall_share: float = 0.3
     wall_m: Range = (0.5, 3.0)
     mover_share: float = 0.15
@@ -82,7 +82,7 @@ class Ranges:
     diffuse_db: Range = (-3.0, 3.0)
     points_db: Range = (-3.0, 3.0)
     imbalance_scale: Range = (0.5, 1.5)
-    phong: Range = (0.0, 1.0)
+    phong: Range = (0.0, 0.6)
     walk_m: Range = (0.003, 0.012)
     yaw_walk_deg: Range = (0.06, 0.3)
     tilt_deg: Range = (0.0, 0.3)
