@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.config import require
+from edge.errors import DependencyError
 from edge.frames import Float32, Float64
 from train.auction import assign
 from train.nearest import nearest_distance
@@ -21,7 +22,13 @@ F_UNIT_SHARE = 0.01
 """F@1 %: threshold as a share of the truth's bounding-box diagonal (the unit frame of the published tables)."""
 
 
-def shape_metrics(prediction_m: Float32, truth_m: Float32, seed: int = 0, with_emd: bool = True) -> dict[str, float]:
+def shape_metrics(
+    prediction_m: Float32,
+    truth_m: Float32,
+    seed: int = 0,
+    with_emd: bool = True,
+    diagonal_m: float | None = None,
+) -> dict[str, float]:
     """Compare one cloud with its truth, both at true scale.
 
     Args:
@@ -29,13 +36,16 @@ def shape_metrics(prediction_m: Float32, truth_m: Float32, seed: int = 0, with_e
         truth_m: float32 [t, 3], metres, uniform by area.
         seed: of the points drawn for EMD.
         with_emd: compute EMD as well (some tenths of a second).
+        diagonal_m: of the object's own bounding box, the unit of the unit frame; None: of the box of ``truth_m`` along
+            the axes of the frame, which is larger for an object that stands askew.
     Returns:
         ``cd_cm``: mean of both mean nearest distances (unsquared), the head figure. ``cd_sum_cm``: their sum.
         ``cd_squared_cm2``: sum of both mean squared distances (the paper's equation). ``accuracy_cm``: prediction to
         truth. ``completeness_cm``: truth to prediction. ``f_5cm``, ``f_10cm``: harmonic mean of precision and recall.
-        ``f_1pct``: the same at 1 % of the truth's bounding-box diagonal. ``emd_cm``, ``emd_squared_cm2``: mean
-        distance and mean squared distance under the assignment of 2048 points that minimises the mean distance
-        (within 1 %); NaN without EMD.
+        ``f_1pct``: the same at 1 % of the diagonal. ``emd_cm``, ``emd_squared_cm2``: mean distance and mean squared
+        distance under the assignment of 2048 points that minimises the mean distance (within 1 %); NaN without EMD.
+        ``cd_unit_cm``, ``emd_unit_cm``: ``cd_cm`` and ``emd_cm`` after scaling the object to a diagonal of 1 m (the
+        frame of the paper's version with box priors).
     Raises:
         ConfigError: an empty cloud or values that are not finite.
     """
@@ -47,7 +57,8 @@ def shape_metrics(prediction_m: Float32, truth_m: Float32, seed: int = 0, with_e
             "[n >= 1, 3], finite",
         )
     forth, back = nearest_distance(prediction_m, truth_m), nearest_distance(truth_m, prediction_m)
-    diagonal_m = float(np.linalg.norm(truth_m.max(axis=0) - truth_m.min(axis=0)))
+    if diagonal_m is None:
+        diagonal_m = float(np.linalg.norm(truth_m.max(axis=0) - truth_m.min(axis=0)))
     result = {
         "cd_cm": 50 * (forth.mean() + back.mean()),
         "cd_sum_cm": 100 * (forth.mean() + back.mean()),
@@ -60,6 +71,8 @@ def shape_metrics(prediction_m: Float32, truth_m: Float32, seed: int = 0, with_e
     }
     distance_m = emd_distances(prediction_m, truth_m, seed) if with_emd else np.array([np.nan])
     result |= {"emd_cm": 100 * distance_m.mean(), "emd_squared_cm2": 1e4 * np.square(distance_m).mean()}
+    unit_m = max(diagonal_m, 1e-9)
+    result |= {"cd_unit_cm": result["cd_cm"] / unit_m, "emd_unit_cm": result["emd_cm"] / unit_m}
     return {name: float(value) for name, value in result.items()}
 
 
@@ -82,6 +95,27 @@ def emd_distances(prediction_m: Float32, truth_m: Float32, seed: int, points: in
     partner = assign(first, second, EMD_TOLERANCE)
     distance: Float64 = np.linalg.norm(first.astype(np.float64) - second[partner], axis=1)
     return distance
+
+
+def emd_excess(first_m: Float32, second_m: Float32, seed: int = 0, points: int = EMD_POINTS) -> float:
+    """How far the auction's EMD lies above the exact one (scipy's assignment), as a share; some seconds.
+
+    Args:
+        first_m, second_m: as in ``emd_distances``, which draws the same points.
+        seed, points: see there.
+    Raises:
+        DependencyError: no scipy.
+    """
+    try:
+        from scipy.optimize import linear_sum_assignment
+    except ImportError as error:
+        raise DependencyError("the exact assignment needs scipy", action="pip install 'rfconstruct[train]'") from error
+    rng = np.random.default_rng(seed)
+    first, second = (_draw(cloud, points, rng).astype(np.float64) for cloud in (first_m, second_m))
+    cost = np.linalg.norm(first[:, None] - second[None], axis=2)
+    exact = float(cost[linear_sum_assignment(cost)].mean())
+    found = float(emd_distances(first_m, second_m, seed, points).mean())
+    return found / exact - 1 if exact > 0 else 0.0
 
 
 def _draw(cloud: Float32, points: int, rng: np.random.Generator) -> Float32:

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a completed shape can be trusted: calibrated probabilities from what is known without the truth.
+
+Three logistic models share one set of measures: the shape is within ``shape_limit_m`` of the truth, the class is right,
+and the cloud is a road user at all. ``train.confidence`` fits them on held-out data; they travel in the manifest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge.errors import ModelError
+from edge.frames import FULL_WINDOW_FRAMES, Float32, Float64
+
+HEADS = ("shape", "class", "known")
+NEAR_M, SEEN_M = 0.10, 0.30
+_INPUT_ROWS, _SURFACE_ROWS = 256, 2048
+_CUT = 4.0
+"""Standardised measures are cut here: nothing is extrapolated far beyond the fit."""
+_ODDS_LIMIT = 6.0
+_FAR_M = 1.0
+
+
+class Trust(NamedTuple):
+    """Probabilities, each 0..1.
+
+    Args:
+        shape: a road user whose completed surface has a Chamfer distance below the limit.
+        class_right: a road user of the most probable class.
+        known: a road user, and not a wall, a bush, a pole.
+    """
+
+    shape: float
+    class_right: float
+    known: float
+
+
+def measures(
+    points_m: Float32,
+    fine_m: Float32,
+    probability: Sequence[float] | Float32,
+    frames: int,
+    sigma_m: float | None = None,
+) -> dict[str, float]:
+    """What is known of an answer without the truth; some 2 ms, the same numbers for any heading.
+
+    Args:
+        points_m: float32 [n, 3], n >= 1, what the network saw; z up, ground 0, metres.
+        fine_m: float32 [m, 3], m >= 1, its answer in the same frame.
+        probability: of the classes, in the manifest's order.
+        frames: of the window.
+        sigma_m: the network's own mean uncertainty of a point, where it gives one.
+    Returns:
+        Name -> number: ``points`` and ``frames`` (log2 against 256 points and a full window, the latter at most 0),
+        ``odds`` (log-odds of the most probable class), ``p0``, ``p1`` .. (class probabilities), ``near`` (share of
+        input points within 10 cm of the answer), ``away_m`` (mean distance of input points from it, each at most 1 m),
+        ``seen`` (share of the answer within 30 cm of an input point), ``long_m``, ``wide_m`` (standard deviations of
+        the input along its horizontal principal axes), ``low_m``, ``high_m`` (5 % and 95 % quantiles of its heights),
+        ``answer_long_m``, ``answer_high_m`` (the same of the answer), and ``sigma_m`` where given.
+    """
+    rows, surface = _some(points_m, _INPUT_ROWS), _some(fine_m, _SURFACE_ROWS)
+    squared = _squared_distances(rows, surface)
+    forth = np.sqrt(squared.min(axis=1))
+    back = np.sqrt(squared.min(axis=0))
+    low, high = np.quantile(points_m[:, 2], (0.05, 0.95))
+    long_m, wide_m = _axes(points_m)
+    chance = np.asarray(probability, dtype=np.float64)
+    top = float(np.clip(chance.max(), 1e-6, 1 - 1e-6))
+    result = {
+        "points": math.log2(len(points_m) / 256),
+        "frames": math.log2(min(max(frames, 1), FULL_WINDOW_FRAMES) / FULL_WINDOW_FRAMES),
+        "odds": min(_ODDS_LIMIT, math.log(top / (1 - top))),
+        **{f"p{number}": float(value) for number, value in enumerate(chance)},
+        "near": float((forth < NEAR_M).mean()),
+        "away_m": float(np.minimum(forth, _FAR_M).mean()),
+        "seen": float((back < SEEN_M).mean()),
+        "long_m": long_m,
+        "wide_m": wide_m,
+        "low_m": float(low),
+        "high_m": float(high),
+        "answer_long_m": _axes(surface)[0],
+        "answer_high_m": float(np.quantile(surface[:, 2], 0.95)),
+    }
+    return result if sigma_m is None else result | {"sigma_m": sigma_m}
+
+
+def _some(cloud: Float32, most: int) -> Float32:
+    """At most ``most`` rows, evenly over the cloud, about no origin in particular."""
+    step = -(-len(cloud) // most)
+    return cloud[::step]
+
+
+def _squared_distances(first: Float32, second: Float32) -> Float32:
+    """All squared distances [n, m], float32; both clouds are centred first, so that rounding stays below 1 mm."""
+    middle = second.mean(axis=0)
+    a, b = first - middle, second - middle
+    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
+    result: Float32 = np.maximum(squared, 0)
+    return result
+
+
+def _axes(cloud: Float32) -> tuple[float, float]:
+    """Standard deviations along the horizontal principal axes, the longer first."""
+    flat = cloud[:, :2].astype(np.float64)
+    flat -= flat.mean(axis=0)
+    narrow, wide = np.sqrt(np.maximum(np.linalg.eigvalsh(flat.T @ flat / len(flat)), 0))
+    return float(wide), float(narrow)
+
+
+@dataclass(frozen=True, slots=True)
+class ConfidenceModel:
+    """Three logistic models over standardised measures z and their squares, each cut at 4 standard deviations.
+
+    Args:
+        names: measures that are used, in order.
+        mean, scale: of each over the data of the fit.
+        heads: "shape", "class", "known" -> weights: a constant, one for every z, one for every z squared.
+        unknown_below: below this probability of the right class the class is "unknown".
+        shape_limit_m: what "shape" promises.
+    """
+
+    names: tuple[str, ...]
+    mean: tuple[float, ...]
+    scale: tuple[float, ...]
+    heads: dict[str, tuple[float, ...]]
+    unknown_below: float
+    shape_limit_m: float
+
+    def trust(self, measured: Mapping[str, float]) -> Trust:
+        """Probabilities for one answer.
+
+        Args:
+            measured: of ``measures``.
+        Raises:
+            ModelError: a measure is missing or not finite.
+        """
+        values = np.array([measured.get(name, math.nan) for name in self.names])
+        if not np.isfinite(values).all():
+            missing = [name for name, value in zip(self.names, values, strict=True) if not math.isfinite(value)]
+            raise ModelError(f"confidence: no value of {', '.join(missing)}", action="use the model's own manifest")
+        terms = basis(values[None], np.array(self.mean), np.array(self.scale))[0]
+        shape, right, known = (_logistic(float(terms @ np.array(self.heads[head]))) for head in HEADS)
+        return Trust(known * shape, known * right, known)
+
+    def is_unknown(self, trust: Trust) -> bool:
+        """Whether the class is better not named."""
+        return trust.class_right < self.unknown_below
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: Any) -> ConfidenceModel:
+        """The model of a manifest.
+
+        Raises:
+            ModelError: keys, types or lengths are wrong, or a number is not finite.
+        """
+        try:
+            model = cls(
+                tuple(str(name) for name in content["names"]),
+                tuple(float(value) for value in content["mean"]),
+                tuple(float(value) for value in content["scale"]),
+                {str(head): tuple(float(v) for v in weights) for head, weights in content["heads"].items()},
+                float(content["unknown_below"]),
+                float(content["shape_limit_m"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise _refused(f"{type(error).__name__}: {error}") from error
+        count = len(model.names)
+        weights = [value for head in model.heads.values() for value in head]
+        numbers = [*model.mean, *model.scale, *weights, model.unknown_below, model.shape_limit_m]
+        rules = (
+            (set(content) == set(cls.__slots__), f"keys {sorted(content)}"),
+            (count > 0 and len(model.mean) == len(model.scale) == count, f"{count} measures"),
+            (set(model.heads) == set(HEADS), f"heads {sorted(model.heads)}"),
+            (all(len(head) == 1 + 2 * count for head in model.heads.values()), "number of weights"),
+            (all(map(math.isfinite, numbers)), "a number that is not finite"),
+            (all(value > 0 for value in (*model.scale, model.shape_limit_m)), "a scale that is not positive"),
+            (0 <= model.unknown_below <= 1, f"unknown_below {model.unknown_below}"),
+        )
+        for holds, what in rules:
+            if not holds:
+                raise _refused(what)
+        return model
+
+
+def basis(values: Float64, mean: Float64, scale: Float64) -> Float64:
+    """Terms of the logistic models [n, 1 + 2 k] from measures [n, k]: one, z, z squared."""
+    z = np.clip((values - mean) / scale, -_CUT, _CUT)
+    return np.concatenate([np.ones((len(z), 1)), z, z * z], axis=1)
+
+
+def _logistic(value: float) -> float:
+    return 1 / (1 + math.exp(-min(max(value, -30.0), 30.0)))
+
+
+def _refused(what: str) -> ModelError:
+    return ModelError(
+        "wrong confidence section of a manifest",
+        value=what,
+        allowed="names, mean, scale, heads (shape, class, known), unknown_below, shape_limit_m",
+        action="install the model again",
+    )
