@@ -11,9 +11,6 @@ from numba import njit
 from edge.frames import Float32, Float64
 from train.objects.sampling import Int32
 
-NOTHING = -1
-"""Face number of a pixel that no face covers."""
-
 
 @dataclass(frozen=True, slots=True)
 class Hits:

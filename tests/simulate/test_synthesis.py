@@ -68,7 +68,7 @@ def ideal_frame(radar: Radar, scatterers: Scatterers) -> Any:
     "radar",
     [
         cascade(),
-        cascade("vertical", array_sign=-1, range_offset_m=0.07),
+        cascade("vertical", array_sign=-1, range_offset_m=0.07, power_offset_db=3.0),
         cascade(rig="cascade_pair_fine"),
         single_chip(),
         single_chip(samples=182),

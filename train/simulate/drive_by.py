@@ -133,11 +133,11 @@ class DriveBy:
                 "this drive-by has no such frame", value=f"{radar} {number}", allowed=f"0..{self.frames - 1}"
             )
         t_ns = self.t_first_chirp_ns(radar, number)
-        synthesizer = self._synthesizers[radar]
+        synthesizer, mounting = self._synthesizers[radar], self.rig.radars[radar].mounting
         with self.times.measure("optics"):
             scatterers, ground = self._optics.scatterers(
                 *(radar, self.seconds(t_ns), self._position_m(t_ns), self._rotation, self._velocity_m_s),
-                synthesizer.reach_m,
+                *(synthesizer.reach_m + min(mounting.range_offset_m, 0.0), np.asarray(mounting.position_m)),
             )
         with self.times.measure("synthesis"):
             return synthesizer.frame(scatterers, self._front_ends[radar], number, t_ns, ground)

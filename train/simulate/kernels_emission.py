@@ -14,7 +14,7 @@ from train.objects.sampling import Int32
 from train.simulate.kernels_optics import DIRECT, GROUND, MIXED, UInt8
 
 NEAREST_M = 0.1
-"""Scatterers nearer to the rig's origin are left out."""
+"""Scatterers nearer to the board's phase centre are left out."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -37,7 +37,7 @@ def _legs(
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Amplitude of both legs of a path, pattern and ground included, and half its length (infinite: no such path).
 
-    ``x, y, z`` is the scatterer in the rig frame; ``ground`` and ``pattern`` are those of ``emit``.
+    ``x, y, z`` is the scatterer from the board's phase centre, rig axes; ``ground``, ``pattern`` are those of ``emit``.
     """
     direct = math.sqrt(x * x + y * y + z * z)
     if x <= 0.0 or direct < NEAREST_M:
@@ -71,6 +71,7 @@ def emit(
     path: UInt8,
     owner: Int32,
     placing: Float64,
+    centre: Float64,
     ground: Float64,
     pattern: Float64,
     limits: Float64,
@@ -89,7 +90,8 @@ def emit(
         owner: int32 [k], row of ``placing``.
         placing: float64 [objects, 5, 3], rows 0..2 rotation object to rig, 3 origin in the rig frame, 4 velocity
             relative to the rig in rig axes.
-        ground: float64 [6], unit normal in the rig frame, height of the rig's origin, permittivity (field in the
+        centre: float64 [3], the board's phase centre in the rig frame.
+        ground: float64 [6], unit normal in the rig frame, height of the phase centre, permittivity (field in the
             ground's plane: negative), (2 pi s / lambda)^2.
         pattern: see ``_loss_db``.
         limits: float64 [3], longest half path, LSB of sigma 1 m^2 at 1 m, least |amplitude| in LSB.
@@ -104,7 +106,7 @@ def emit(
         x = place[0, 0] * px + place[0, 1] * py + place[0, 2] * pz + place[3, 0]
         y = place[1, 0] * px + place[1, 1] * py + place[1, 2] * pz + place[3, 1]
         z = place[2, 0] * px + place[2, 1] * py + place[2, 2] * pz + place[3, 2]
-        legs, half_path = _legs(x, y, z, path[i], ground, pattern)
+        legs, half_path = _legs(x - centre[0], y - centre[1], z - centre[2], path[i], ground, pattern)
         size = limits[1] * board[i] * legs
         if half_path >= limits[0] or abs(weight[i]) * abs(size) < limits[2]:
             continue

@@ -271,8 +271,7 @@ def receive_legs(  # type: ignore[no-untyped-def]
         turn: float32 [chips, 2 * span], overwritten: cosine and sine of the turn per slot.
         cell: float32 [2, chips, capacity], overwritten: middle of the group's cells less ``base``, change per second.
         base, shortest, longest: as for ``transmit_legs``.
-        path: float64 [2 * RX + 2, BLOCK], scratch, its rates 0 when nothing moves.
-        cosines, work: float32 [RX, BLOCK] and [4, RX, BLOCK], scratch.
+        path, cosines, work: scratch; float64 [2 RX + 2, BLOCK], rates 0 when nothing moves, float32 [RX or 4 RX, BLOCK]
     """
     middle_s, back_s, slot_s = timing[0], timing[0] - timing[1], timing[2]
     for first in range(0, count, BLOCK):

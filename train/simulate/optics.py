@@ -22,7 +22,7 @@ from train.simulate.visibility import SceneVisibility, Sight, View
 from train.simulate.weights import Entries, Weigher, join, strongest
 
 REACH_MARGIN_M = 0.3
-"""Between the longest half path from the rig's origin and that from any antenna during the burst."""
+"""Between the longest half path from the board's phase centre and that from any antenna during the burst."""
 CLUTTER_IMBALANCE_DB = 2.0
 MOVER_STEPS = 3
 """A moving object hides others as from the nearest point of a grid this many times as wide as its own."""
@@ -76,6 +76,7 @@ class SceneOptics:
         rig_rotation: Float64,
         rig_velocity_m_s: Float64,
         reach_m: float,
+        board_m: Float64 | None = None,
     ) -> tuple[Scatterers, GroundPlane]:
         """What one radar sees in a burst.
 
@@ -86,6 +87,8 @@ class SceneOptics:
             rig_rotation: float64 [3, 3], rig to world.
             rig_velocity_m_s: float64 [3], world.
             reach_m: longest half path that the synthesis accepts.
+            board_m: float64 [3], the board's phase centre in the rig frame, from which ranges and directions of the
+                amplitudes count; None: the rig's origin.
         Returns:
             Scatterers and the ground in the rig frame.
         """
@@ -104,13 +107,16 @@ class SceneOptics:
         placing[-1, 3] = rotation.T @ (self._clutter_origin_m - position)
         placing[-1, 4] = rotation.T @ -np.asarray(rig_velocity_m_s, dtype=np.float64)
         plane = GroundPlane(np.ascontiguousarray(rotation[2]), float(position[2]))
-        return self._emit(radar, placing, plane, reach_m), plane
+        board = np.zeros(3) if board_m is None else np.asarray(board_m, dtype=np.float64)
+        return self._emit(radar, placing, plane, reach_m, board), plane
 
-    def _emit(self, radar: RadarId, placing: Float64, plane: GroundPlane, reach_m: float) -> Scatterers:
+    def _emit(
+        self, radar: RadarId, placing: Float64, plane: GroundPlane, reach_m: float, board_m: Float64
+    ) -> Scatterers:
         entries, antenna, settings = self._entries, self._antenna, self._settings.ground
         permittivity = settings.permittivity * (-1.0 if settings.polarization(radar) == "H" else 1.0)
         roughness = (2.0 * math.pi * settings.roughness_m / self._wavelength_m) ** 2
-        ground = np.array([*plane.normal, plane.offset_m, permittivity, roughness])
+        ground = np.array([*plane.normal, plane.offset_m + plane.normal @ board_m, permittivity, roughness])
         edges = (antenna.along_edge_deg, antenna.along_loss_db, antenna.across_edge_deg, antenna.across_loss_db)
         pattern = np.array([1.0 if radar == "horizontal" else 2.0, *edges, antenna.max_loss_db])
         limits = np.array([reach_m - REACH_MARGIN_M, self._lsb_per_m, self._least_lsb])
@@ -118,7 +124,7 @@ class SceneOptics:
         place, velocity = np.empty((room, 3)), np.empty((room, 3))
         amplitude, image = np.empty(room, np.complex64), np.empty((2, room), np.bool_)
         columns = (entries.position, entries.weight, entries.board[RADARS.index(radar)], entries.path, entries.owner)
-        n = emit(*columns, placing, ground, pattern, limits, place, velocity, amplitude, image)
+        n = emit(*columns, placing, board_m, ground, pattern, limits, place, velocity, amplitude, image)
         return Scatterers(place[:n], velocity[:n], amplitude[:n], image[0, :n], image[1, :n])
 
     def _views(self, now: Sequence[Placed], position_m: Float64, step_m: float) -> list[View]:

@@ -6,7 +6,8 @@ Written apart from the synthesis, from the board's tables and the radar's geomet
     x[l, m, n, i] = sum_k a_k exp(j 2 pi (f_c tau + S tau t_i)),  tau = (|p_k(t) - A_m| + |p_k(t) - B_n| - 2 r_0) / c
 
 with t_i = (i - Ns / 2) / fs, p_k(t) = p_k + v_k t, t = (l M + m) Tc the start of the chirp of slot m in loop l, A_m and
-B_n the antennas or, for a leg by way of the ground, their mirror images, and r_0 the mounting's range offset.
+B_n the antennas or, for a leg by way of the ground, their mirror images, and r_0 the mounting's range offset; its power
+offset lowers a_k.
 """
 
 from __future__ import annotations
@@ -79,6 +80,7 @@ def direct_sum(
     transmitters_m, receivers_m = antennas_m(radar)
     chirp_s = (np.arange(count)[:, None] * layout.slots + np.arange(layout.slots)) * profile.chirp_time_s
     sample_s = (np.arange(layout.samples) - layout.samples / 2.0) / profile.sample_rate_hz
+    level = 10.0 ** (-radar.mounting.power_offset_db / 20.0)
     total = np.zeros((count, layout.slots, len(receivers_m), layout.samples), dtype=np.complex128)
     for k in range(len(scatterers)):
         a = _mirrored(transmitters_m, ground) if scatterers.tx_image[k] else transmitters_m
@@ -88,5 +90,5 @@ def direct_sum(
         back_m = np.linalg.norm(place_m[:, :, None, :] - b, axis=-1)
         delay_s = (out_m[:, :, None] + back_m - 2.0 * radar.mounting.range_offset_m)[..., None] / C_M_S
         cycles = profile.center_frequency_hz * delay_s + profile.slope_hz_per_s_actual * delay_s * sample_s
-        total += complex(scatterers.amplitude[k]) * np.exp(2j * np.pi * cycles)
+        total += level * complex(scatterers.amplitude[k]) * np.exp(2j * np.pi * cycles)
     return total

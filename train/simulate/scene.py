@@ -13,6 +13,7 @@ import numpy as np
 from edge.frames import Float64
 from train.objects.mesh import CLASSES, ClassName, Mesh
 from train.objects.reference import ObjectRef
+from train.simulate.materials import WALL
 from train.simulate.settings import SceneSettings
 from train.simulate.surface import Placed, Surface, make_surface
 from train.simulate.surface_settings import SurfaceSettings
@@ -23,8 +24,6 @@ POOL_NEAREST_M = 3.0
 """Distance for which their patches are fine enough."""
 WALL_SIZE_M = (14.0, 2.5)
 """Length and height; it has no thickness."""
-WALL_DB = -9.0
-"""Concrete instead of sheet metal: 0.32 of 0.95 in amplitude."""
 MOVERS: tuple[ClassName, ...] = ("pedestrian", "bicycle")
 IN_FRONT_SHARE = 0.3
 """Of the movers that pass between radar and target."""
@@ -144,7 +143,7 @@ def _wall(wavelength_m: float) -> Surface:
     x_m, z_m = 0.5 * WALL_SIZE_M[0], WALL_SIZE_M[1]
     vertices = np.array([[-x_m, 0, 0], [x_m, 0, 0], [x_m, 0, z_m], [-x_m, 0, z_m]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    settings = SurfaceSettings(reflection_db=WALL_DB)
+    settings = SurfaceSettings(car=WALL)
     return make_surface(Mesh(vertices, faces, 0, "scene/wall"), settings, 6.0, wavelength_m, np.random.default_rng(0))
 
 

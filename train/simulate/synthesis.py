@@ -112,7 +112,8 @@ class Synthesizer:
     """Raw bursts of one radar from point scatterers.
 
     Args:
-        radar: board, schedule, mounting; its calibration is not used.
+        radar: board, schedule, mounting; its calibration is not used. What its range and power offsets take out again
+            is in the samples.
         width: grid cells to either side of a scatterer: 4 (power of the error about -85 dB) or 6 (-105 dB and
             less).
     Raises:
@@ -155,7 +156,8 @@ class Synthesizer:
         index = np.arange(layout.samples) - first
         inverse = np.sqrt(shape / np.pi) * np.exp(np.square(np.pi * index / cells) / shape)
         self._correction = np.repeat(inverse, RX).astype(np.float32)
-        self._unfiltered = self._response = np.ones(cells + 1, dtype=np.complex64)
+        self._level = np.complex64(10.0 ** (-radar.mounting.power_offset_db / 20.0))
+        self._unfiltered = self._response = np.full(cells + 1, self._level)
         self._filtered_by: FrontEnd | None = None
         self._moving, self._tangents, self._slot_s = False, 1, profile.chirp_time_s
         self._path, self._scratch = zeros((2 * RX + 2, BLOCK), np.float64), zeros((4, RX, BLOCK))
@@ -216,7 +218,7 @@ class Synthesizer:
         shape = (chips, layout.loops, layout.slots, layout.samples * 2 * RX)
         codes = adc.reshape(shape) if direct else np.empty(shape, dtype=np.int16)
         if self._filtered_by is not front_end:
-            self._filtered_by, self._response = front_end, front_end.if_response(self._cells)
+            self._filtered_by, self._response = front_end, self._level * front_end.if_response(self._cells)
         self._place(scatterers, ground, self._response)
         for loop in range(layout.loops):
             if loop == 0 or self._moving or front_end.per_chirp:

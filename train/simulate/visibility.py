@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.frames import Float32, Float64
+from train.depth_scan import look_at
 from train.objects.sampling import Int32
 from train.simulate import kernels_visibility as kernels
 from train.simulate.kernels_optics import SEEN, SEEN_IN_GROUND
@@ -139,7 +140,7 @@ class SceneVisibility:
         middle = views[number].rotation @ (0.5 * (surface.low_m + surface.high_m)) - eyes[number]
         if np.linalg.norm(middle[:2]) < 1e-6:
             return None
-        axes = _look(middle)
+        axes = look_at(np.zeros(3), middle)
         window = np.array([np.inf, np.inf, -np.inf, -np.inf])
         turned, eye = self._project(number, views[number].rotation, eyes[number], axes, window)
         if not window[0] < window[2] or not window[1] < window[3]:
@@ -168,11 +169,3 @@ class SceneVisibility:
         turned, eye = np.ascontiguousarray(axes @ rotation), rotation.T @ eye_m
         kernels.to_camera(self._surfaces[number].vertices, turned, eye, self._camera[number], window)
         return turned, eye
-
-
-def _look(towards: Float64) -> Float64:
-    """Rows right, down and forward of a camera that looks along ``towards`` [3], which is not vertical."""
-    forward = towards / np.linalg.norm(towards)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
