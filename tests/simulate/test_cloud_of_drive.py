@@ -27,7 +27,8 @@ from train.simulate.cloud import (
     truth_in_frame,
 )
 from train.simulate.drive_by import DriveBy
-from train.simulate.randomise import Ranges
+from train.simulate.randomise import Ranges, draw
+from train.simulate.settings import TrackSettings
 
 CAR = ObjectRef("car", "parametric_00001")
 EASY = Ranges(
@@ -94,6 +95,15 @@ def test_a_pipeline_of_its_own_gives_the_same_points(drive: DriveBy, easy: Simul
     shared = run(drive, [])
     for ledgers in (pipeline.ledgers, shared.ledgers):
         assert all(ledger.snapshot().frames_ok == drive.frames for ledger in ledgers.values())
+
+
+def test_given_settings_are_taken_as_they_are(mesh: Mesh) -> None:
+    settings = replace(draw(EASY, 5), track=TrackSettings(40, frame_period_s=0.02, every=4))
+    made = make_drive(DriveSpec(CAR, 11, EASY, every=3, settings=settings), mesh)
+    assert made.settings is settings
+    assert made.frames == 10
+    assert made.true_pose(made.t_first_chirp_ns("horizontal", 9)).position_m[0] == pytest.approx(9 * 0.08 * 0.5)
+    assert made.placed[0].position_m[0] == pytest.approx(0.5 * 40 * 0.02 * 0.5 + settings.scene.along_m, abs=0.3)
 
 
 def cloud_at(middle_m: Float64, count: int, window: FusedCloud, spread_m: float = 0.2) -> ObjectCloud:

@@ -106,7 +106,7 @@ def test_a_walking_point_is_seen_where_it_is_in_every_frame(rig: Rig) -> None:
 
 
 def test_both_boards_see_a_point_at_the_level_of_their_geometry(rig: Rig) -> None:
-    """Own-array pattern taken out by the imager; range and pattern across the array as they are seen from each board."""
+    """Own-array pattern taken out by the imager; range and pattern across it as seen from each board."""
     made, kept = drive(rig, [Placed(point_surface((0.0, 0.0, 0.0), SIGMA_M2), STANDING_M)])
     across: dict[RadarId, int] = {"horizontal": 2, "vertical": 1}
     constant_db: dict[RadarId, list[float]] = {radar: [] for radar in RADARS}

@@ -54,6 +54,19 @@ def test_draws_fill_their_ranges_and_stay_inside() -> None:
     assert {d.processing.window for d in drawn} == {"taylor", "hann"}
 
 
+def test_faults_that_nobody_measured_are_drawn_when_asked_for() -> None:
+    names = ("start_jitter", "second_harmonic", "phase_noise", "iq_image")
+    plain = [draw(Ranges(), seed).front_end for seed in range(50)]
+    assert not any(f.start_jitter_s or f.second_harmonic_dbc or f.phase_noise_dbc_hz or f.iq_image_db for f in plain)
+    always = [draw(Ranges(**{f"{name}_share": 1.0 for name in names}), seed).front_end for seed in range(50)]  # type: ignore[arg-type]
+    for key in ("start_jitter_s", "second_harmonic_dbc", "phase_noise_dbc_hz", "iq_image_db"):
+        low, high = getattr(Ranges(), key)
+        values = [getattr(front_end, key) for front_end in always]
+        assert low <= min(values) < max(values) <= high
+    half = [draw(Ranges(iq_image_share=0.5), seed).front_end for seed in SEEDS]
+    assert np.mean([f.iq_image_db is not None for f in half]) == pytest.approx(0.5, abs=3.5 * 0.5 / np.sqrt(len(SEEDS)))
+
+
 def test_speed_is_kept_inside_its_range() -> None:
     drawn = [draw(Ranges(frames=(10, 600)), seed).track for seed in SEEDS]
     assert min(t.speed_m_s for t in drawn) >= 0.3

@@ -44,6 +44,7 @@ class DriveSpec:
         ranges: from which the settings are drawn.
         rig: name or folder of the rig.
         every: only each n-th frame is made.
+        settings: of the drive-by, its ``track.every`` instead of ``every``; None: drawn from ``ranges``.
     """
 
     object: ObjectRef
@@ -51,6 +52,7 @@ class DriveSpec:
     ranges: Ranges = field(default_factory=Ranges)
     rig: str = "cascade_demo"
     every: int = 3
+    settings: SimulationSettings | None = None
 
     def __post_init__(self) -> None:
         require(self.every >= 1, "drive.every", self.every, ">= 1")
@@ -147,10 +149,12 @@ def make_drive(spec: DriveSpec, mesh: Mesh) -> DriveBy:
     """The drive-by of a spec; ``mesh`` is that of its object. The target is the first of its objects."""
     base = _rig(spec.rig)
     schedule = next(iter(base.radars.values())).schedule
-    settings = draw(spec.ranges, spec.seed, schedule.frame_period_s)
-    settings = replace(settings, track=replace(settings.track, every=min(spec.every, settings.track.frames)))
+    settings = spec.settings
+    if settings is None:
+        settings = draw(spec.ranges, spec.seed, schedule.frame_period_s)
+        settings = replace(settings, track=replace(settings.track, every=min(spec.every, settings.track.frames)))
     rig = settings.processing.applied(base)
-    duration_s = settings.track.frames * schedule.frame_period_s
+    duration_s = settings.track.frames * (settings.track.frame_period_s or schedule.frame_period_s)
     placed = make_scene(
         *(mesh, settings.scene, settings.surface, settings.track.speed_m_s * duration_s, duration_s),
         *(float(schedule.profile.wavelength_m), spec.seed),

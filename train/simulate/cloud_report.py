@@ -14,6 +14,7 @@ from train.objects.mesh import CLASSES, ClassName
 from train.objects.reference import ObjectRef, library_refs
 from train.simulate.cloud import DriveSpec, SimulatedCloud, Windows, make_drive, observe, run
 from train.simulate.randomise import Ranges
+from train.simulate.settings import SimulationSettings
 
 PARAMETRIC_SHARE = 3
 """Every third object is parametric where there is a library."""
@@ -59,7 +60,14 @@ def report_objects(name: ClassName, count: int) -> list[ObjectRef]:
     return [library[k] for k in chosen] + [ObjectRef(name, f"parametric_{3 * k:05d}") for k in range(made)]
 
 
-def report(count: int, ranges: Ranges, rig: str, every: int, say: Callable[[str], None] = print) -> list[Measured]:
+def report(
+    count: int,
+    ranges: Ranges,
+    rig: str,
+    every: int,
+    settings: SimulationSettings | None = None,
+    say: Callable[[str], None] = print,
+) -> list[Measured]:
     """Drive past ``count`` objects of every class and print medians of their figures and of the stages' times.
 
     The first drive-by of all is done twice, so that tables, compilation and the pool of neighbours count nowhere.
@@ -67,7 +75,8 @@ def report(count: int, ranges: Ranges, rig: str, every: int, say: Callable[[str]
     say(HEAD)
     every_one: list[Measured] = []
     for name in CLASSES:
-        specs = [DriveSpec(r, FIRST_SEED + k, ranges, rig, every) for k, r in enumerate(report_objects(name, count))]
+        objects = report_objects(name, count)
+        specs = [DriveSpec(ref, FIRST_SEED + k, ranges, rig, every, settings) for k, ref in enumerate(objects)]
         if not every_one:
             measure_drive(specs[0])
         measured = [measure_drive(spec) for spec in specs]

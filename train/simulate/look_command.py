@@ -24,12 +24,15 @@ def add_verbs(verbs: Any) -> None:
     for verb in (montage, clouds):
         verb.add_argument("--rig", default="cascade_demo", help="name or folder of a rig with two radars")
         verb.add_argument("--every", type=int, default=3, help="only each n-th frame")
+        verb.add_argument("--settings", type=Path, metavar="TOML", help="settings, instead of drawn ones")
 
 
 def _montage(options: argparse.Namespace) -> int:
     from train.simulate.montage import write_montages
+    from train.simulate.settings import read_settings
 
-    for made in write_montages(options.out, options.object, options.seed, options.rig, options.every):
+    settings = read_settings(options.settings) if options.settings else None
+    for made in write_montages(options.out, options.object, options.seed, options.rig, options.every, settings):
         figures = made.statistics
         print(
             f"{made.spec.object}: {made.status}, {figures.points} points in {made.frames} frames, "
@@ -42,7 +45,9 @@ def _montage(options: argparse.Namespace) -> int:
 def _clouds(options: argparse.Namespace) -> int:
     from train.simulate.cloud_report import report
     from train.simulate.randomise import Ranges
+    from train.simulate.settings import read_settings
 
     ranges = Ranges(ground_share=0.0) if options.without_ground else Ranges()
-    report(options.objects, ranges, options.rig, options.every)
+    settings = read_settings(options.settings) if options.settings else None
+    report(options.objects, ranges, options.rig, options.every, settings)
     return int(ExitCode.OK)

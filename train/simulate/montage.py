@@ -24,6 +24,7 @@ from train.objects.sampling import sample_surface
 from train.perturb import perturb
 from train.perturb_settings import PerturbSettings
 from train.simulate.cloud import DriveSpec, SimulatedCloud, find_target, make_drive, observe, run
+from train.simulate.settings import SimulationSettings
 
 MARGIN_M = 0.6
 TRUTH_POINTS = 4000
@@ -63,14 +64,21 @@ class Kept:
         self.windows.append(result)
 
 
-def write_montages(folder: Path, objects: Sequence[str], seed: int, rig: str, every: int) -> list[SimulatedCloud]:
+def write_montages(
+    folder: Path,
+    objects: Sequence[str],
+    seed: int,
+    rig: str,
+    every: int,
+    settings: SimulationSettings | None = None,
+) -> list[SimulatedCloud]:
     """A picture of a drive-by for every object, ``simulated_<class>.png``, numbered when there are several of a class.
 
     Args:
         folder: is made when it is not there.
         objects: text forms of ObjectRefs; empty: a parametric object of every class.
         seed: of the drive-bys.
-        rig, every: as in ``DriveSpec``.
+        rig, every, settings: as in ``DriveSpec``.
     Raises:
         DependencyError: matplotlib is not installed.
         RfconstructError: the folder cannot be written, no such object or rig, or nothing was seen of an object.
@@ -81,7 +89,7 @@ def write_montages(folder: Path, objects: Sequence[str], seed: int, rig: str, ev
         ref = ObjectRef.from_text(text)
         number = sum(one.spec.object.class_name == ref.class_name for one in made)
         name = f"simulated_{ref.class_name}" + (f"_{number + 1}" if number else "")
-        made.append(montage(DriveSpec(ref, seed, rig=rig, every=every), folder / f"{name}.png"))
+        made.append(montage(DriveSpec(ref, seed, rig=rig, every=every, settings=settings), folder / f"{name}.png"))
     return made
 
 

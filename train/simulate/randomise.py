@@ -45,6 +45,9 @@ class Ranges:
         noise_lsb: of a complex sample, rms; only scales all amplitudes. noise_figure_db, gain_dbi: link budget.
         across_loss_db, across_edge_deg: true antenna pattern across the array; the pipeline believes the rig's.
         gain_spread_db, residual_deg, leakage: channel mismatch, calibration error, leakage over noise.
+        start_jitter_share, second_harmonic_share, phase_noise_share, iq_image_share: how often a board has this fault;
+            start_jitter_s, second_harmonic_dbc, phase_noise_dbc_hz, iq_image_db: how much of it, see
+            ``FrontEndSettings``. Nobody has measured them on these boards: none by default.
         ground_share: how often there is ground. permittivity, ground_roughness_m, clutter_db: of it.
         reflection_db, diffuse_db, points_db, imbalance_scale, phong: surface.
         walk_m, yaw_walk_deg, tilt_deg, time_offset_s, mounting_deg, mounting_m: odometry; see ``OdometrySettings``.
@@ -74,6 +77,14 @@ class Ranges:
     gain_spread_db: Range = (1.2, 3.9)
     residual_deg: Range = (0.0, 6.0)
     leakage: Range = (25.0, 95.0)
+    start_jitter_share: float = 0.0
+    start_jitter_s: Range = (0.0, 1.1e-9)
+    second_harmonic_share: float = 0.0
+    second_harmonic_dbc: Range = (-80.0, -55.0)
+    phase_noise_share: float = 0.0
+    phase_noise_dbc_hz: Range = (-97.0, -91.0)
+    iq_image_share: float = 0.0
+    iq_image_db: Range = (-45.0, -30.0)
     ground_share: float = 1.0
     permittivity: Range = (3.0, 5.0)
     ground_roughness_m: Range = (0.3e-3, 2e-3)
@@ -136,6 +147,9 @@ class _Draw:
     def happens(self, name: str) -> bool:
         return bool(self._rng(name).random() < getattr(self._ranges, name))
 
+    def sometimes(self, name: str, share: str) -> float | None:
+        return self.uniform(name) if self.happens(share) else None
+
     def index(self, name: str) -> int:
         return int(self._rng(name).integers(len(getattr(self._ranges, name))))
 
@@ -157,8 +171,8 @@ def draw(ranges: Ranges, seed: int, frame_period_s: float = FRAME_PERIOD_S) -> S
             yaw_deg=take.uniform("yaw_deg"),
             neighbours=take.whole("neighbours"),
             gap_m=take.uniform("gap_m"),
-            wall_m=take.uniform("wall_m") if take.happens("wall_share") else 0.0,
-            mover_speed_m_s=take.uniform("mover_m_s") if take.happens("mover_share") else 0.0,
+            wall_m=take.sometimes("wall_m", "wall_share") or 0.0,
+            mover_speed_m_s=take.sometimes("mover_m_s", "mover_share") or 0.0,
         ),
         surface=SurfaceSettings(
             reflection_db=take.uniform("reflection_db"),
@@ -215,4 +229,8 @@ def _front_end(take: _Draw) -> FrontEndSettings:
         gain_spread_db=take.uniform("gain_spread_db"),
         residual_deg=take.uniform("residual_deg"),
         leakage=take.uniform("leakage"),
+        start_jitter_s=take.sometimes("start_jitter_s", "start_jitter_share") or 0.0,
+        second_harmonic_dbc=take.sometimes("second_harmonic_dbc", "second_harmonic_share"),
+        phase_noise_dbc_hz=take.sometimes("phase_noise_dbc_hz", "phase_noise_share"),
+        iq_image_db=take.sometimes("iq_image_db", "iq_image_share"),
     )

@@ -34,6 +34,8 @@ def add_verb(verbs: Any) -> None:
     )
     verb.add_argument("name", help="rig: name or folder, for example cascade_pair or awr1843_pair")
     verb.add_argument("--object", metavar="REF", help="drive past this object, for example car/parametric_00012")
+    verb.add_argument("--settings", type=Path, metavar="TOML", help="with --object: settings, instead of drawn ones")
+    verb.add_argument("--poses", type=Path, metavar="FILE", help="with --object: write its reported poses as CSV too")
     verb.add_argument("--frames", type=int, help="make this many frames first and repeat them (point targets: 8)")
     verb.add_argument("--seed", type=int, default=0, help="of scene and faults")
     verb.add_argument("--pace", type=float, default=1.0, help="1: real time, 2: twice as fast, 0: as fast as it goes")
@@ -105,13 +107,20 @@ def _scene(options: argparse.Namespace) -> tuple[Rig, FrameSupply, Iterable[Pose
     from train.simulate.supplies import rendered, straight_poses, targets
 
     if options.object is None:
+        if options.settings or options.poses:
+            raise ConfigError("rig --settings, --poses", allowed="with --object only")
         rig = load_rig(options.name)
         return rig, targets(rig, options.frames or 8, options.seed), straight_poses(rig)
     from train.objects.reference import ObjectRef
     from train.simulate.cloud import DriveSpec, make_drive
+    from train.simulate.pose_stream import write_poses
+    from train.simulate.settings import read_settings
 
-    spec = DriveSpec(ObjectRef.from_text(options.object), options.seed, rig=options.name, every=1)
+    settings = read_settings(options.settings) if options.settings else None
+    spec = DriveSpec(ObjectRef.from_text(options.object), options.seed, rig=options.name, every=1, settings=settings)
     drive = make_drive(spec, spec.object.mesh())
+    if options.poses:
+        write_poses(options.poses, drive.poses)
     supply = rendered(drive.rig, drive.frame, options.frames) if options.frames else drive.frame
     return drive.rig, supply, drive.poses
 

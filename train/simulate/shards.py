@@ -14,7 +14,6 @@ import hashlib
 import math
 import os
 import zlib
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -313,8 +312,3 @@ def _cloud(record: dict[str, Any], xyz_m: Float32, power: NDArray[np.int8], step
         record["status"],
         record["error"],
     )
-
-
-def total_points(clouds: Sequence[Cloud]) -> int:
-    """Points of all clouds."""
-    return sum(len(cloud) for cloud in clouds)
