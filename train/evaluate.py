@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluation of exported models, baselines and the floor on held-out objects."""
+"""Evaluation of predictors, baselines and the floor on held-out objects: one list of figures for each."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,14 +12,22 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
+from edge.completion.model import UNKNOWN
 from edge.errors import ModelError
 from edge.frames import Float32
-from train.baselines import Bank, resampled
+from train.baselines import FLOOR, Bank, floor
 from train.dataset import CLASSES, CompletionDataset, Sample
+from train.held_out import Case, HeldOut, spread
 from train.metrics import Summary, shape_metrics, summarize
+from train.predictors import Answer, Predictor
 
-FLOOR = "floor (truth sampled twice)"
+__all__ = ["BIKE", "FLOOR", "MACRO", "PAPER", "OnnxModel", "Scores", "evaluate", "int8_is_good", "measure", "spread"]
+
 MACRO = "macro"
+BIKE = "bike"
+"""Bicycles and motorcycles as one class, as in the paper's tables."""
+PAPER = "macro of car, bike, pedestrian"
+_BIKES = {CLASSES.index("bicycle"), CLASSES.index("motorcycle")}
 
 
 class OnnxModel:
@@ -53,7 +61,7 @@ class Scores:
     """Figures of one predictor, one entry a sample.
 
     Args:
-        values: metric name -> values.
+        values: metric name -> values; NaN where a sample has none.
         objects, labels: of each sample.
     """
 
@@ -68,28 +76,88 @@ class Scores:
         self.objects.append(sample.object_id)
         self.labels.append(sample.label)
 
-    def _rows(self, class_name: str) -> list[int]:
-        return [row for row, label in enumerate(self.labels) if class_name in (MACRO, CLASSES[label])]
+    def _rows(self, class_name: str) -> tuple[list[int], list[int]]:
+        """Samples that belong to a class or mean, and the classes that are averaged."""
+        labels = [min(_BIKES) if class_name in (BIKE, PAPER) and n in _BIKES else n for n in self.labels]
+        if class_name in (MACRO, PAPER):
+            return list(range(len(labels))), labels
+        wanted = min(_BIKES) if class_name == BIKE else CLASSES.index(class_name)
+        return [row for row, label in enumerate(labels) if label == wanted], labels
 
     def measured(self, metric: str, class_name: str = MACRO) -> bool:
         """Whether the figure exists for the class."""
-        return any(np.isfinite(self.values[metric][row]) for row in self._rows(class_name))
+        values = self.values.get(metric)
+        return values is not None and any(np.isfinite(values[row]) for row in self._rows(class_name)[0])
 
     def summary(self, metric: str, class_name: str = MACRO) -> Summary:
-        """A figure of one class or of the mean over classes; ConfigError when nothing was measured."""
-        rows = self._rows(class_name)
+        """A figure of one class, of ``BIKE``, or of a mean over classes; ConfigError when nothing was measured."""
+        rows, labels = self._rows(class_name)
         values = self.values[metric]
-        return summarize([values[r] for r in rows], [self.objects[r] for r in rows], [self.labels[r] for r in rows])
+        return summarize([values[r] for r in rows], [self.objects[r] for r in rows], [labels[r] for r in rows])
 
     @property
     def classes(self) -> list[str]:
         """Classes that occur, in order."""
         return [name for label, name in enumerate(CLASSES) if label in self.labels]
 
+    def worst(self, count: int = 10, metric: str = "cd_cm") -> list[int]:
+        """Samples with the largest figure, the worst first."""
+        values = np.array(self.values[metric])
+        order = np.argsort(-np.where(np.isfinite(values), values, -np.inf), kind="stable")
+        return [int(row) for row in order[:count]]
 
-def spread(length: int, count: int) -> list[int]:
-    """At most ``count`` indices, evenly over 0..length - 1, each once."""
-    return sorted(set(np.linspace(0, length - 1, min(count, length)).astype(int).tolist()))
+
+def figures(case: Case, answer: Answer, with_emd: bool) -> dict[str, float]:
+    """All figures of one answer.
+
+    Returns:
+        Those of ``shape_metrics``, and with class probabilities ``class_right`` (0 or 1), ``paper_class_right`` (same,
+        with bicycle and motorcycle as one class), ``probability`` (of the most probable class); with a confidence
+        ``confidence`` and ``named`` (1: not "unknown").
+    """
+    sample = case.sample
+    result = shape_metrics(answer.fine_m, sample.truth, case.number, with_emd, case.diagonal_m)
+    if answer.probability is not None:
+        best = int(np.argmax(answer.probability))
+        same = best == sample.label or {best, sample.label} <= _BIKES
+        result |= {"class_right": float(best == sample.label), "paper_class_right": float(same)}
+        result |= {"probability": float(answer.probability[best])}
+    if answer.confidence is not None:
+        result |= {"confidence": answer.confidence, "named": float(answer.class_name != UNKNOWN)}
+    return result
+
+
+def measure(
+    predictors: Mapping[str, Predictor], cases: Sequence[Case], emd_cases: int = 0, threads: int = 1
+) -> dict[str, Scores]:
+    """Ask every predictor every case.
+
+    Args:
+        predictors: name -> predictor.
+        cases: held-out samples.
+        emd_cases: of these, evenly spread, how many also get EMD.
+        threads: cases at once.
+    Returns:
+        Name -> scores: ``figures`` and ``time_ms``.
+    """
+    with_emd = set(spread(len(cases), emd_cases)) if emd_cases else set()
+    scores = {name: Scores() for name in predictors}
+
+    def one(position: int) -> tuple[Sample, dict[str, dict[str, float]]]:
+        case = cases[position]
+        results = {}
+        for name, predictor in predictors.items():
+            start = time.perf_counter()
+            answer = predictor(case)
+            seconds = time.perf_counter() - start if answer.seconds is None else answer.seconds
+            results[name] = figures(case, answer, position in with_emd) | {"time_ms": 1e3 * seconds}
+        return case.sample, results
+
+    with ThreadPoolExecutor(threads) as pool:
+        for sample, results in pool.map(one, range(len(cases))):
+            for name, metrics in results.items():
+                scores[name].add(sample, metrics)
+    return scores
 
 
 def evaluate(
@@ -100,51 +168,44 @@ def evaluate(
     bank: Bank | None = None,
     threads: int = 1,
 ) -> dict[str, Scores]:
-    """Compare models, baselines and the floor with the truth.
+    """Compare exported models, baselines and the floor with the truth.
 
     Args:
-        models: name -> model.
+        models: name -> model, the reference of ``shift_cm`` first.
         dataset: held-out split.
         samples: samples used, evenly spread; ``emd_samples`` of them also get EMD.
         bank: training shapes for the baselines; None = no baselines.
         threads: metrics computed at once.
     Returns:
-        Predictor -> scores: the metrics of ``shape_metrics``; models also ``class_right`` (0 or 1), ``time_ms`` and,
-        when the fp32 model is among them, ``shift_cm``: rms displacement of the fine points against it.
+        Predictor -> scores as in ``measure``; models also have ``shift_cm``, the rms displacement of the fine points
+        against the first model's.
     """
-    indices = spread(len(dataset), samples)
-    with_emd = {indices[i] for i in spread(len(indices), emd_samples)} if emd_samples else set()
-    scores: dict[str, Scores] = {}
-
-    def one(index: int) -> list[tuple[str, Sample, dict[str, float]]]:
-        sample = dataset[index]
-        results = _of_models(models, sample, index, index in with_emd)
-        for name, predictor in (bank.predictors() if bank else {}).items():
-            results[name] = shape_metrics(predictor(sample), sample.truth, index, index in with_emd)
-        first, second = resampled(dataset, index, len(sample.truth))
-        results[FLOOR] = shape_metrics(first, second, index, index in with_emd)
-        return [(name, sample, metrics) for name, metrics in results.items()]
-
-    with ThreadPoolExecutor(threads) as pool:
-        for results in pool.map(one, indices):
-            for name, sample, metrics in results:
-                scores.setdefault(name, Scores()).add(sample, metrics)
+    cases = HeldOut(dataset).spread(samples)
+    predictors: dict[str, Predictor] = {name: _bare(model) for name, model in models.items()}
+    scores = measure(
+        predictors | (bank.predictors() if bank else {}) | {FLOOR: floor},
+        cases,
+        min(emd_samples, len(cases)),
+        threads,
+    )
+    for name, shifts in _shifts(models, dataset, cases.indices).items():
+        scores[name].values["shift_cm"] = shifts
     return scores
 
 
-def _of_models(models: dict[str, OnnxModel], sample: Sample, seed: int, with_emd: bool) -> dict[str, dict[str, float]]:
-    results: dict[str, dict[str, float]] = {}
-    reference: Float32 | None = None
-    for name, model in models.items():
-        start = time.perf_counter()
-        fine, _, probability = model(sample.partial)
-        elapsed_ms = 1e3 * (time.perf_counter() - start)
-        metrics = shape_metrics(fine, sample.truth, seed, with_emd)
-        reference = fine if reference is None else reference
-        shift_cm = 100 * float(np.sqrt(np.square(fine - reference).sum(axis=1).mean()))
-        right = float(int(probability.argmax()) == sample.label)
-        results[name] = metrics | {"class_right": right, "time_ms": elapsed_ms, "shift_cm": shift_cm}
-    return results
+def _bare(model: OnnxModel) -> Predictor:
+    return lambda case: Answer(*model(case.sample.partial))
+
+
+def _shifts(models: dict[str, OnnxModel], dataset: CompletionDataset, indices: list[int]) -> dict[str, list[float]]:
+    """Rms displacement in cm of every model's fine points against the first model's."""
+    shifts: dict[str, list[float]] = {name: [] for name in models}
+    for index in indices if models else []:
+        answers = {name: model(dataset[index].partial)[0] for name, model in models.items()}
+        reference = next(iter(answers.values()))
+        for name, fine in answers.items():
+            shifts[name].append(100 * float(np.sqrt(np.square(fine - reference).sum(axis=1).mean())))
+    return shifts
 
 
 def int8_is_good(scores: dict[str, Scores], full: str, small: str, limit: float = 0.01) -> bool:
@@ -167,21 +228,24 @@ TABLE: Sequence[tuple[str, str]] = (
 )
 
 
-def table(scores: dict[str, Scores], rows: Sequence[tuple[str, str, str]]) -> str:
+def table(
+    scores: Mapping[str, Scores], rows: Sequence[tuple[str, str, str]], columns: Sequence[tuple[str, str]] = TABLE
+) -> str:
     """A Markdown table of means.
 
     Args:
-        scores: of ``evaluate``.
-        rows: (label, predictor, class or "macro").
+        scores: of ``measure``.
+        rows: (label, predictor, class or mean).
+        columns: (metric, title); shares with three digits, others with two.
     """
-    lines = ["| | " + " | ".join(title for _, title in TABLE) + " |", "|---" * (len(TABLE) + 1) + "|"]
+    lines = ["| | " + " | ".join(title for _, title in columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for label, predictor, class_name in rows:
         cells = []
-        for metric, _ in TABLE:
+        for metric, _ in columns:
             if not scores[predictor].measured(metric, class_name):
                 cells.append("–")
                 continue
             mean = scores[predictor].summary(metric, class_name).mean
-            cells.append(f"{mean:.3f}" if metric.startswith("f_") else f"{mean:.2f}")
+            cells.append(f"{mean:.2f}" if metric.endswith(("_cm", "_cm2")) else f"{mean:.3f}")
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

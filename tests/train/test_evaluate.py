@@ -43,7 +43,7 @@ def test_simple_baselines(train: CompletionDataset) -> None:
 
 def test_evaluation_has_every_baseline_and_a_low_floor(train: CompletionDataset) -> None:
     scores = evaluate({}, CompletionDataset("val", DATA, 0), 4, 1, Bank(train, 8))
-    assert len(scores) == 5
+    assert len(scores) == 6
     assert scores[FLOOR].summary("cd_cm").mean < 4
     assert scores["collapse to centre"].summary("cd_cm").mean > scores["input as output"].summary("cd_cm").mean
     assert scores[FLOOR].classes == list(CLASSES)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be evaluated: an answer to a held-out case, from the edge runtime, a checkpoint or any callable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from edge.completion.model import UNKNOWN, CompletionModel
+from edge.config import CompletionSettings
+from edge.errors import ModelError
+from edge.frames import Float32, ObjectCloud, Pose
+from train.held_out import Case
+
+if TYPE_CHECKING:
+    from train.network import CompletionNetwork
+
+_SENSOR_M = 10.0
+
+
+class Answer(NamedTuple):
+    """What a predictor says; all but the points may be absent.
+
+    Args:
+        fine_m: float32 [n, 3], metres, frame of the input.
+        coarse_m: float32 [m, 3], same frame.
+        probability: float32 [classes], in the order of ``train.dataset.CLASSES``.
+        confidence: 0..1. class_name: what would be published.
+        sigma_m: the network's own mean uncertainty of a point.
+        seconds: time of the answer where the predictor knows better than the clock around it.
+    """
+
+    fine_m: Float32
+    coarse_m: Float32 | None = None
+    probability: Float32 | None = None
+    confidence: float | None = None
+    class_name: str = ""
+    sigma_m: float | None = None
+    seconds: float | None = None
+
+
+Predictor = Callable[[Case], Answer]
+
+
+def object_cloud(case: Case) -> ObjectCloud:
+    """A case as the edge pipeline would hand it over: the sensor stands on the negative x axis (line of sight)."""
+    points = case.sample.partial
+    sensor_m = points.mean(axis=0, dtype=np.float64) - (_SENSOR_M, 0, 0)
+    pose = Pose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    power_db = np.zeros(len(points), np.float32)
+    return ObjectCloud(case.number, points, power_db, pose, 0, 0, 0.0, case.frames, True, sensor_m)
+
+
+class EdgePredictor:
+    """A shipped model through the code that runs on the vehicle: manifest, hashes, known answer, confidence.
+
+    Args:
+        folder: model folder.
+        file: of the folder; None: the default one.
+    Raises:
+        ModelError: of ``CompletionModel.load``.
+    """
+
+    def __init__(self, folder: Path, file: str | None = None) -> None:
+        self.model = CompletionModel.load(folder, CompletionSettings(), file=file)
+
+    @property
+    def box_frame(self) -> bool:
+        """Whether the model wants the object's own frame (the setting with box priors)."""
+        return self.model.manifest.input_frame == "object"
+
+    def __call__(self, case: Case) -> Answer:
+        """The answer; ModelError for a cloud that the runtime refuses."""
+        shape = self.model.complete(object_cloud(case))
+        if shape is None:
+            raise ModelError(
+                "the runtime gives no shape", value=f"{len(case.sample.partial)} points", action="use larger clouds"
+            )
+        named = np.array([shape.class_probability.get(name, 0.0) for name in self.model.manifest.classes], np.float32)
+        seconds = 1e-6 * sum(shape.latency_us.values())
+        known = shape.class_probability.get(UNKNOWN, 0.0) < 1
+        return Answer(
+            shape.fine_m,
+            shape.coarse_m,
+            named if known else None,
+            shape.confidence,
+            shape.class_name,
+            seconds=seconds,
+        )
+
+
+class TorchPredictor:
+    """A network in PyTorch, in evaluation mode.
+
+    Args:
+        network: takes points [n, 3] in metres and [n], gives ``coarse``, ``fine``, ``logits`` (None: no classifier).
+    """
+
+    def __init__(self, network: CompletionNetwork) -> None:
+        self.network = network.eval()
+
+    def __call__(self, case: Case) -> Answer:
+        """The answer."""
+        import torch
+
+        with torch.inference_mode():
+            points = torch.from_numpy(case.sample.partial)
+            answer = self.network(points, [len(points)])
+        logits = answer.logits
+        fine, coarse = answer.fine[0].float().numpy(), answer.coarse[0].float().numpy()
+        if logits is None:
+            return Answer(fine, coarse)
+        probability = logits[0].float().softmax(0).numpy()
+        return Answer(fine, coarse, probability)
