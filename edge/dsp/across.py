@@ -91,6 +91,10 @@ class AcrossMotion:
         steps = min(math.ceil(most), MOST_STEPS) if most > 0.5 else 0
         return np.asarray(np.arange(-steps, steps + 1) * self.step_m_s, dtype=np.float64)
 
+    def every_speed_m_s(self) -> Float64:
+        """Speeds across the array, float64 [MOST_STEPS], in the middle of those that lead to 3, 5, 7 ... maps."""
+        return np.asarray((np.arange(1, MOST_STEPS + 1) - 0.25) * (self.step_m_s / tdm.FOV_COSINE))
+
     def correlation(self, maps: int, loops: int) -> Float64:
         """|rho|^2 of the noise of two cells, float64 [maps, angle], by difference of maps and of angle bins.
 

@@ -11,7 +11,7 @@ psi the phases that the point has, c(u_0) = v_x sqrt(1 - u_0^2) + v_along u_0 it
 sector's beam undoes, with the tangent in the place of c. The w_c are the least squares solution for the resting
 pattern within its main lobe and 0 beyond, beyond reweighted by the error (Lawson 1961) until the lobes are level;
 a ridge, rho |w|^2, keeps the noise within about 1 dB. Speeds are rounded to GRID_M_S, which costs less than 1 dB of
-lobes at -30 dB; weights are kept by speed, since solving for them takes milliseconds.
+lobes at -30 dB; weights are kept by sector and speed, since solving for them takes one to two milliseconds.
 """
 
 from __future__ import annotations
@@ -37,66 +37,114 @@ MAIN_LOBE_WEIGHT = 2.0
 LOBES_FROM = 1.03
 """Nulls from the middle: the main lobe may widen by so much."""
 OUTER, BENT_SHARE = (0.8, 0.95), 0.25
+DIRECTIONS = np.linspace(-tdm.FOV_COSINE, tdm.FOV_COSINE, POINTS)
+LOBE = np.array([-0.9, -0.7, -0.5, -0.3, 0.0, 0.3, 0.5, 0.7, 0.9])
+"""Points within the main lobe, nulls from its middle."""
+MOST_POINTS = (BEAMS + 2 * len(OUTER)) * (POINTS + len(LOBE))
 MOST_KEPT = 2000
+Int64 = NDArray[np.int64]
 
 
 class BeamWeights:
     """Weights of one burst of one loop.
 
     Args:
-        position: float64 [channel], in elements from the row's middle.
-        time_s: float64 [channel], from the middle of the burst.
+        element, slot: int64 [channel].
+        slot_s: from slot to slot.
         taper: float64 [element], the window at rest.
         pitch: element spacing in wavelengths, two-way phase 2 pi pitch u per element.
         wavelength_m: at the middle of the ADC window.
     """
 
-    def __init__(self, position: Float64, time_s: Float64, taper: Float64, pitch: float, wavelength_m: float) -> None:
-        self._along, self._wavenumber_t = 2.0 * math.pi * pitch * position, 4.0 * math.pi / wavelength_m * time_s
-        self._resting = 2.0 * math.pi * pitch * (np.arange(len(taper)) - 0.5 * (len(taper) - 1))
+    def __init__(
+        self, element: Int64, slot: Int64, slot_s: float, taper: Float64, pitch: float, wavelength_m: float
+    ) -> None:
+        self._step = 2.0 * math.pi * pitch, 4.0 * math.pi / wavelength_m * slot_s
+        self._index = np.stack((element - element.min(), slot - slot.min()))
+        elements, slots = self._index.max(axis=1) + 1
+        self._place = np.stack((element - 0.5 * (len(taper) - 1), self._index[1] - 0.5 * (slots - 1)))
+        self._resting = self._step[0] * (np.arange(len(taper)) - 0.5 * (len(taper) - 1))
         self._taper = taper / taper.sum()
         self._null = tables.main_lobe(taper, 1024) / (1024.0 * pitch)
         response = tables.response_envelope(taper, 1024)
         self._level = HEADROOM * float(response.max(where=response < 1.0, initial=0.0))
+        self._pair, self._of = channel_pairs(self._index)
+        channels = len(element)
+        self._along, self._late, self._line = (np.zeros(n * MOST_POINTS) for n in (2 * elements, 4 * slots, 6))
+        self._sums, self._normal = np.zeros(self._pair.shape[1]), np.zeros((channels, channels))
         self._kept: dict[tuple[float, ...], Float64] = {}
+        self.solved = 0
+        """Sectors that were solved for, ever."""
+
+    def known(self, sector: tdm.Sector, forward_m_s: float, along_m_s: float) -> Float64 | None:
+        """Weights float64 [channel] of one sector, which sum to about 1, if they were solved for."""
+        return self._kept.get(_key(sector, forward_m_s, along_m_s))
 
     def of(self, sector: tdm.Sector, forward_m_s: float, along_m_s: float) -> Float64:
-        """Weights float64 [channel] of one sector, which sum to about 1."""
-        forward_m_s, along_m_s = (GRID_M_S * round(speed / GRID_M_S) for speed in (forward_m_s, along_m_s))
-        key = (sector.centre, sector.half_width, forward_m_s, along_m_s)
+        """The same, solved for when they are not known."""
+        key = _key(sector, forward_m_s, along_m_s)
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
-            self._kept[key] = self._solve(sector, forward_m_s, along_m_s)
+            self._kept[key] = self._solve(sector, *key[2:])
+            self.solved += 1
         return self._kept[key]
 
+    def forget(self) -> None:
+        """Start anew: what was solved for is unknown again."""
+        self._kept.clear()
+
     def _solve(self, sector: tdm.Sector, forward_m_s: float, along_m_s: float) -> Float64:
-        equations = self._equations(sector, forward_m_s, along_m_s)
-        channels = equations[0].shape[1]
-        weight, normal = np.zeros((2, channels)), np.zeros((channels, channels))
-        level_lobes(*equations, MAIN_LOBE_WEIGHT, RIDGE, self._level, ROUNDS, normal, weight)
-        return np.asarray(weight[0])
+        step, point, beyond = self._equations(sector, forward_m_s, along_m_s)
+        points = len(beyond)
+        elements, slots = self._index.max(axis=1) + 1
+        weight = np.zeros((3, self._place.shape[1]))
+        level_lobes(
+            *(step, point, beyond, self._place, self._index, self._pair, self._of),
+            *(MAIN_LOBE_WEIGHT, RIDGE, self._level, ROUNDS),
+            self._along[: 2 * elements * points].reshape(2, elements, points),
+            self._late[: 4 * slots * points].reshape(4, slots, points),
+            self._line[: 6 * points].reshape(6, points),
+            *(self._sums, self._normal, weight),
+        )
+        return np.array(weight[0])
 
     def _equations(
         self, sector: tdm.Sector, forward_m_s: float, along_m_s: float
     ) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-        """Rows (re, im alternating) of S, its resting value, and which points lie beyond the main lobe."""
-        rows, wanted, beyond = [], [], []
+        """Phase steps, shares and wanted responses, what lies beyond the main lobe, as ``level_lobes`` takes them."""
+        away, late, shares, wanted, outside = [], [], [], [], []
         for n, (u, share) in enumerate(_beams(sector)):
-            points = np.linspace(-tdm.FOV_COSINE, tdm.FOV_COSINE, POINTS) + (n % 3 - 1) * tdm.FOV_COSINE / (
-                1.5 * POINTS
-            )
-            lobe = u + self._null * np.array([-0.9, -0.7, -0.5, -0.3, 0.0, 0.3, 0.5, 0.7, 0.9])
+            points = DIRECTIONS + (n % 3 - 1) * tdm.FOV_COSINE / (1.5 * POINTS)
+            lobe = u + self._null * LOBE
             points = np.concatenate((points[np.abs(points - u) > LOBES_FROM * self._null], lobe[np.abs(lobe) < 1.0]))
-            outside = np.abs(points - u) > self._null
+            beyond = np.abs(points - u) > self._null
             closing_m_s = forward_m_s * np.sqrt(np.maximum(1.0 - points * points, 0.0)) + along_m_s * points
-            away = closing_m_s - sector_closing_m_s(sector, u, forward_m_s, along_m_s)
-            phase = np.outer(points - u, self._along) + np.outer(away, self._wavenumber_t)
-            rows.append(share * np.stack((np.cos(phase), np.sin(phase)), axis=1).reshape(-1, phase.shape[1]))
-            resting = np.cos(np.outer(points - u, self._resting)) @ self._taper
-            wanted.append(share * np.where(outside, 0.0, resting))
-            beyond.append(outside)
-        return np.concatenate(rows), np.concatenate(wanted), np.concatenate(beyond)
+            away.append(points - u)
+            late.append(closing_m_s - sector_closing_m_s(sector, u, forward_m_s, along_m_s))
+            resting = np.zeros(len(points))
+            resting[~beyond] = np.cos(np.outer(points[~beyond] - u, self._resting)) @ self._taper
+            shares.append(np.full(len(points), share))
+            wanted.append(resting)
+            outside.append(beyond)
+        step = np.stack((np.concatenate(away), np.concatenate(late))) * np.array(self._step)[:, None]
+        return step, np.stack((np.concatenate(shares), np.concatenate(wanted))), np.concatenate(outside)
+
+
+def _key(sector: tdm.Sector, forward_m_s: float, along_m_s: float) -> tuple[float, float, float, float]:
+    forward_m_s, along_m_s = (GRID_M_S * round(speed / GRID_M_S) for speed in (forward_m_s, along_m_s))
+    return sector.centre, sector.half_width, forward_m_s, along_m_s
+
+
+def channel_pairs(index: Int64) -> tuple[Int64, Int64]:
+    """Different differences of two channels, int64 [2, pairs], and which of them two channels have, int64 [n, n].
+
+    The cosine of a phase is even, so that a difference and its opposite count as one, elements not negative.
+    """
+    apart = index[:, :, None] - index[:, None, :]
+    apart = np.where((apart[0] < 0) | ((apart[0] == 0) & (apart[1] < 0)), -apart, apart)
+    pair, of = np.unique(apart.reshape(2, -1), axis=1, return_inverse=True)
+    return np.ascontiguousarray(pair), np.ascontiguousarray(of.reshape(apart.shape[1:]))
 
 
 def sector_closing_m_s(sector: tdm.Sector, u: float, forward_m_s: float, along_m_s: float) -> float:

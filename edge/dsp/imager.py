@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.calibration import Calibration
 from edge.config import AntennaSettings, HeatmapSettings, require
 from edge.dsp import tables, tdm
-from edge.dsp.across import AcrossMotion
+from edge.dsp.across import MOST_STEPS, AcrossMotion
 from edge.dsp.antenna import along_loss_db
+from edge.dsp.blocks import Blocks
 from edge.dsp.buffers import aligned, zeros
 from edge.dsp.checks import FrameReport, dead_names, reject_all_zero, reject_saturated
 from edge.dsp.doppler import DopplerFft
@@ -24,7 +26,7 @@ from edge.dsp.kernels_checks import all_zero, dead_channels
 from edge.dsp.kernels_doppler import PADDING, channel_kernel
 from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
 from edge.dsp.row import RowGeometry
-from edge.dsp.steering import Steering
+from edge.dsp.steering import SOLVES_A_FRAME, Steering
 from edge.errors import CaptureError
 from edge.frames import BurstMotion, Complex64, Float32, Float64, Heatmap, PointResponse, RadarFrame
 from edge.waveform import SPEED_OF_LIGHT_M_S
@@ -76,7 +78,8 @@ class Imager:
         self._loop_time_s = layout.slots * float(self._profile.chirp_time_s)
         self._most_loops = min(settings.loops, layout.loops) if settings.loops else layout.loops
         self._make_axes(antenna)
-        self._make_blocks()
+        self._blocks = Blocks.of(layout, self.geometry, settings.read_elevation)
+        self._channels = self.geometry.channels()
         self._make_windows()
         self._make_buffers()
 
@@ -91,44 +94,12 @@ class Imager:
         (self._sector,) = tdm.divide(cosine, 1)
         self._focus_range_m = np.maximum(range_m, SHORTEST_RANGE_M)
 
-    def _make_blocks(self) -> None:
-        """A block is one slot of one device; those of the row come first, then those beside it if they are read."""
-        layout, element = self.layout, self.geometry.element
-        by_block = element.reshape(layout.slots, layout.devices, layout.rx)
-        every = [(s, d) for d in range(layout.devices) for s in range(layout.slots)]
-        pairs = [(s, d) for s, d in every if (by_block[s, d] >= 0).any()]
-        self._row_blocks = len(pairs)
-        if self.settings.read_elevation:
-            pairs += [(s, d) for s, d in every if not (by_block[s, d] >= 0).any()]
-        chirp = layout.samples * layout.rx
-        self._loop_stride = layout.slots * chirp
-        starts = [d * layout.loops * self._loop_stride + s * chirp for s, d in pairs]
-        self._block_start = np.array(starts, dtype=np.int64)
-        row = pairs[: self._row_blocks]
-        self._block_slot = np.array([s for s, _ in row], dtype=np.int64)
-        self._block_element = np.ascontiguousarray([by_block[s, d] for s, d in row], dtype=np.int64)
-        self._pairs = pairs
-        interleaved = layout.kind == "cascade"
-        slot, receiver = np.indices((layout.slots, layout.devices * layout.rx))
-        device, rx = receiver // layout.rx, receiver % layout.rx
-        first = device * layout.loops * self._loop_stride + slot * chirp + rx * (1 if interleaved else layout.samples)
-        self._channel_start = np.ascontiguousarray(first, dtype=np.int64)
-        self._channels = self.geometry.channels()
-        index = self._channels.index(layout.slots, layout.devices * layout.rx)
-        by_block = index.reshape(layout.slots, layout.devices, layout.rx)
-        self._block_channel = np.ascontiguousarray([by_block[s, d] for s, d in row])
-        self._channel_step = layout.rx if interleaved else 2
-        self._channel_word = 1 if interleaved else 2
-
     def _make_windows(self) -> None:
         """Complex windows before and focusing phasors after the range FFT, [block, (re, im), points * rx]."""
         layout, calibration, geometry = self.layout, self.radar.calibration, self.geometry
         samples, rx = layout.samples, layout.rx
         taper = tables.taper(self.settings, "range", samples, samples / 2)
-        n = np.arange(samples)
-        shift = np.asarray(calibration.range_shift_bins, dtype=np.float64)
-        ramp = np.exp(-2j * np.pi * shift[..., None] * n / samples)
-        channel = np.asarray(calibration.gain)[..., None] * ramp * (taper / taper.sum())
+        self._range_taper = taper / taper.sum()
         angle_taper = tables.taper(self.settings, "angle", geometry.count, (geometry.count - 1) / 2)
         weight = geometry.channel_weight(angle_taper / angle_taper.sum())
         self._rows = np.arange(self.points, dtype=np.int64) * rx
@@ -138,23 +109,27 @@ class Imager:
             baked = tables.curvature_m(calibration.reference_range_m, a, b)
             phase = -2.0 * np.pi / self._wavelength_m * (tables.curvature_m(self._focus_range_m, a, b) - baked)
         phasor = np.exp(1j * phase)
-        self._window = zeros((len(self._pairs), 2, self.points * rx))
-        self._focus, self._phasors = (zeros((self._row_blocks, 2, self.points * rx)) for _ in range(2))
+        self._window = zeros((len(self._blocks.pairs), 2, self.points * rx))
+        self._tabulate_calibration()
+        self._focus, self._phasors = (zeros((self._blocks.row, 2, self.points * rx)) for _ in range(2))
+        self._blocks.tabulate(weight[..., None] * phasor, self._focus)
+        self._blocks.tabulate(phasor, self._phasors)
         self._elevation = ElevationRows(
-            *(self.radar, self._pairs, phasor, self._rows, geometry.transmit_m[:, None] + geometry.receive_m),
+            *(self.radar, self._blocks.pairs, phasor, self._rows, geometry.transmit_m[:, None] + geometry.receive_m),
             *(self._transmit_time_s, self._wavelength_m),
         )
-        sources = ((self._window, channel), (self._focus, weight[..., None] * phasor), (self._phasors, phasor))
-        for block, (s, d) in enumerate(self._pairs):
-            for table, source in sources[: 3 if block < self._row_blocks else 1]:
-                values = source[s, d * rx : (d + 1) * rx].T.reshape(-1)
-                table[block, 0, : len(values)] = values.real
-                table[block, 1, : len(values)] = values.imag
         self._make_response(taper, angle_taper, weight)
         self._across = AcrossMotion(
             *(geometry, angle_taper, self._transmit_time_s, self._wavelength_m, self._motion_rad_s_m),
             *(self._loop_time_s, (self.settings.angle_bins, self.points), self._gain),
         )
+
+    def _tabulate_calibration(self) -> None:
+        """Range taper, gain and range shift of every channel into ``_window``."""
+        calibration, samples = self.radar.calibration, self.layout.samples
+        shift = np.asarray(calibration.range_shift_bins, dtype=np.float64)
+        ramp = np.exp(-2j * np.pi * shift[..., None] * np.arange(samples) / samples)
+        self._blocks.tabulate(np.asarray(calibration.gain)[..., None] * ramp * self._range_taper, self._window)
 
     def _make_response(self, taper: Float64, angle_taper: Float64, weight: Float64) -> None:
         """What motion and the spherical wavefront do to a target's peak: weighted least squares over the row.
@@ -204,7 +179,7 @@ class Imager:
         self._angle_twiddle = tables.twiddles(bins, +1, 0)
         self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
         self._phasor = np.ones(layout.slots, dtype=np.complex64)
-        self._spectra, self._sums = zeros((len(self._pairs), 2 * plane)), zeros(2 * plane)
+        self._spectra, self._sums = zeros((len(self._blocks.pairs), 2 * plane)), zeros(2 * plane)
         self._spectra_rows = self._spectra.view(np.complex128)
         self._range_work, self._row_work = zeros(2 * plane), zeros(2 * plane)
         self._range_rows = self._range_work.view(np.complex128)
@@ -236,6 +211,24 @@ class Imager:
         unfolded = len(self._channels.pairs) > 0 or 4.0 * speed_m_s * self._loop_time_s < self._wavelength_m
         at_m_s, sideways = None if velocity_rig_m_s is None else speed_m_s, unfolded and max(tried, of_partner) > 1
         return tdm.choose(self.settings.doppler, most, coherent, steerable, at_m_s, tried, sideways)
+
+    def recalibrate(self, calibration: Calibration) -> None:
+        """Use another calibration of the same board from the next frame on, as an imager newly made with it would.
+
+        Raises:
+            ConfigError: another reference range, on which the focusing tables depend.
+        """
+        made_m, reference_m = self.radar.calibration.reference_range_m, calibration.reference_range_m
+        require(reference_m == made_m, "calibration.reference_range_m", reference_m, str(made_m), "make a new imager")
+        self.radar = replace(self.radar, calibration=calibration)
+        self._tabulate_calibration()
+        self._steering.beam_weights.forget()
+
+    def velocities_to_rehearse(self, fastest_m_s: float) -> list[Float64]:
+        """Velocities float64 [3] across the array, one for every number of maps up to this speed."""
+        velocities = np.zeros((MOST_STEPS, 3))
+        velocities[:, 3 - tdm.array_axis(self.radar.radar)] = self._across.every_speed_m_s()
+        return list(velocities[np.abs(velocities).max(axis=1) <= fastest_m_s])
 
     @cached_property
     def _doppler(self) -> DopplerFft:
@@ -305,7 +298,7 @@ class Imager:
     def _run_range(self, adc: NDArray[np.int32], loops: int, blocks: int | None = None) -> int:
         """Fill ``_spectra`` from the raw words, summed over loops; returns the codes at the rails."""
         rails = self._range_kernel(
-            *(adc, loops, self._loop_stride, self._block_start[:blocks], self.layout.samples, self._window),
+            *(adc, loops, self._blocks.loop_stride, self._blocks.start[:blocks], self.layout.samples, self._window),
             *(self._range_twiddle, self._range_order, self._sums, self._range_work, self._range_rows),
             *(self._spectra, self._spectra_rows),
         )
@@ -315,15 +308,15 @@ class Imager:
         """Fill ``_cube`` loop by loop, transmitters beside the row in the last loop; returns the codes at the rails."""
         focus, rails = self._focus if choice.name == "fft" else self._phasors, 0
         for loop in range(choice.loops):
-            blocks = self._row_blocks if loop + 1 < choice.loops else len(self._pairs)
-            rails += self._run_range(adc[loop * self._loop_stride :], 1, blocks)
+            blocks = self._blocks.row if loop + 1 < choice.loops else len(self._blocks.pairs)
+            rails += self._run_range(adc[loop * self._blocks.loop_stride :], 1, blocks)
             self._order_channels(focus, loop)
         return rails
 
     def _order_channels(self, focus: Float32, loop: int) -> None:
         """Focus ``_spectra`` into one loop of ``_cube``."""
         self._channel_kernel(
-            *(self._spectra, focus, self._rows, self._block_channel, self._row_work, loop, self._cube),
+            *(self._spectra, focus, self._rows, self._blocks.channel, self._row_work, loop, self._cube),
         )
 
     def _undo_motion(
@@ -343,14 +336,16 @@ class Imager:
         if summed and first:
             self._order_channels(self._phasors, 0)
         loops = 1 if summed else choice.loops
-        motion = self._steering.run(self._cube, forward_m_s, along_m_s, loops, self._power, extra_m_s)
+        motion = self._steering.run(
+            *(self._cube, forward_m_s, along_m_s, loops, self._power, extra_m_s, SOLVES_A_FRAME if first else 0)
+        )
         if summed and choice.loops > 1:
             self._power *= np.float32(1.0 / choice.loops**2)
         return motion
 
     def _run_angle(self, sector: tdm.Sector) -> None:
         """Fill the sector's rows of ``_power`` from ``_spectra`` and ``_phasor``."""
-        blocks = (self._spectra, self._block_slot, self._block_element, self._focus)
+        blocks = (self._spectra, self._blocks.slot, self._blocks.element, self._focus)
         self._row_kernel(*blocks, self._phasor, self._row_work, self._row)
         self._angle_kernel(
             *(self._row, self._angle_twiddle, self._target, self._gain, sector.first, sector.last),
@@ -367,10 +362,10 @@ class Imager:
 
     def _report(self, adc: NDArray[np.int32], choice: tdm.Choice, rails: int) -> None:
         layout = self.layout
-        beside = len(self._pairs) - self._row_blocks
-        blocks = choice.loops * self._row_blocks + beside * (1 if choice.name in ("steer", "fft") else choice.loops)
+        beside = len(self._blocks.pairs) - self._blocks.row
+        blocks = choice.loops * self._blocks.row + beside * (1 if choice.name in ("steer", "fft") else choice.loops)
         share = rails / (2 * blocks * layout.samples * layout.rx)
-        channels = (self._channel_start, layout.samples, self._channel_step, self._channel_word)
+        channels = (self._blocks.channel_start, layout.samples, self._blocks.channel_step, self._blocks.channel_word)
         dead = dead_channels(adc, *channels, self._dead)
         names = dead_names(self._dead, self.radar.schedule.transmitters) if dead else ()
         self.last_report = FrameReport(choice.loops, share, names, choice.name, choice.reason)

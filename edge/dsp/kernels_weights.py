@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that solves for weights with level lobes: least squares, reweighted by the error (Lawson 1961)."""
+"""Kernel that solves for weights with level lobes: least squares, reweighted by the error (Lawson 1961).
+
+A channel's phase towards a point is linear in its element and in its slot. Entries of the normal matrix depend on the
+differences of two channels only, and most pairs share theirs: the cascade's 144 channels have 621 different ones among
+10440 pairs. Responses are sums over slots of sums over elements. Points are innermost everywhere.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +16,53 @@ from numba import boolean, float64, int64, njit
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 KEPT_EMPHASIS = 0.2
+PLANE, BLOCK, WHOLE = float64[:, ::1], float64[:, :, ::1], int64[:, ::1]
+
+
+@njit(inline="always")
+def _turns(step, out):  # type: ignore[no-untyped-def]
+    """out [(cos, sin), n, points] = exp(j n step), by recurrence."""
+    for p in range(len(step)):
+        out[0, 0, p], out[1, 0, p] = 1.0, 0.0
+    if out.shape[1] > 1:
+        for p in range(len(step)):
+            out[0, 1, p], out[1, 1, p] = np.cos(step[p]), np.sin(step[p])
+    for n in range(2, out.shape[1]):
+        for p in range(len(step)):
+            re, im, cosine, sine = out[0, n - 1, p], out[1, n - 1, p], out[0, 1, p], out[1, 1, p]
+            out[0, n, p] = re * cosine - im * sine
+            out[1, n, p] = re * sine + im * cosine
+
+
+@njit(inline="always")
+def _right_hand_side(step, share, wanted, place, emphasis, right):  # type: ignore[no-untyped-def]
+    """Sum over points of emphasis share^2 wanted cos(phase), by channel."""
+    right[:] = 0.0
+    for p in range(len(share)):
+        if wanted[p] != 0.0:
+            scale = emphasis[p] * share[p] * share[p] * wanted[p]
+            for c in range(len(right)):
+                right[c] += scale * np.cos(place[0, c] * step[0, p] + place[1, c] * step[1, p])
+
+
+@njit(inline="always")
+def _normal_matrix(along, late, share, emphasis, pair, of, sums, normal):  # type: ignore[no-untyped-def]
+    """Lower triangle of sum over points of emphasis share^2 cos(difference of two channels' phases)."""
+    points = len(share)
+    for s in range(late.shape[1]):
+        for p in range(points):
+            scale = emphasis[p] * share[p] * share[p]
+            late[2, s, p], late[3, s, p] = late[0, s, p] * scale, late[1, s, p] * scale
+    for n in range(pair.shape[1]):
+        e, s, both, other = pair[0, n], abs(pair[1, n]), 0.0, 0.0
+        for p in range(points):
+            both += along[0, e, p] * late[2, s, p]
+        for p in range(points):
+            other += along[1, e, p] * late[3, s, p]
+        sums[n] = both - other if pair[1, n] >= 0 else both + other
+    for i in range(normal.shape[0]):
+        for k in range(i + 1):
+            normal[i, k] = sums[of[i, k]]
 
 
 @njit(inline="always")
@@ -33,71 +85,113 @@ def _solve(normal, x):  # type: ignore[no-untyped-def]
             x[k] -= normal[i, k] * x[i]
 
 
+@njit(inline="always")
+def _respond(along, late, share, index, weight, part, error):  # type: ignore[no-untyped-def]
+    """error [point] = share |response|; ``part`` [4, points] holds the sums of one slot and of all of them."""
+    points = len(share)
+    part[:] = 0.0
+    for s in range(late.shape[1]):
+        for p in range(points):
+            part[0, p], part[1, p] = 0.0, 0.0
+        for c in range(len(weight)):
+            if index[1, c] == s:
+                e, w = index[0, c], weight[c]
+                for p in range(points):
+                    part[0, p] += w * along[0, e, p]
+                    part[1, p] += w * along[1, e, p]
+        for p in range(points):
+            part[2, p] += part[0, p] * late[0, s, p] - part[1, p] * late[1, s, p]
+            part[3, p] += part[0, p] * late[1, s, p] + part[1, p] * late[0, s, p]
+    for p in range(points):
+        error[p] = share[p] * np.sqrt(part[2, p] * part[2, p] + part[3, p] * part[3, p])
+
+
+@njit(inline="always")
+def _reweigh(error, beyond, largest, emphasis):  # type: ignore[no-untyped-def]
+    """Emphasis of the points beyond the main lobe by their error, its mean kept."""
+    before, after = 0.0, 0.0
+    for p in range(len(error)):
+        if beyond[p]:
+            before += emphasis[p]
+            emphasis[p] *= KEPT_EMPHASIS + error[p] / largest
+            after += emphasis[p]
+    for p in range(len(error)):
+        if beyond[p]:
+            emphasis[p] *= before / after
+
+
 @njit(
     float64(
-        *(float64[:, ::1], float64[::1], boolean[::1], float64, float64, float64, int64),
-        *(float64[:, ::1], float64[:, ::1]),
+        *(PLANE, PLANE, boolean[::1], PLANE, WHOLE, WHOLE, WHOLE, float64, float64, float64, int64),
+        *(BLOCK, BLOCK, PLANE, float64[::1], PLANE, PLANE),
     ),
     **OPTIONS,
 )
-def level_lobes(rows, wanted, beyond, main_lobe, ridge, level, rounds, normal, weight):  # type: ignore[no-untyped-def]
-    """Real weights of the lowest maximum of |rows w| beyond the main lobe; ends early once it is below ``level``.
+def level_lobes(  # type: ignore[no-untyped-def]
+    step,
+    point,
+    beyond,
+    place,
+    index,
+    pair,
+    of,
+    main_lobe,
+    ridge,
+    level,
+    rounds,
+    along,
+    late,
+    line,
+    sums,
+    normal,
+    weight,
+):
+    """Real weights of the lowest maximum of |response| beyond the main lobe; ends early once it is below ``level``.
+
+    A channel's response to point p has the phase place[0] step[0, p] + place[1] step[1, p].
 
     Args:
-        rows: float64 [2 * points, n], real and imaginary parts alternate.
-        wanted: float64 [points], real.
+        step: float64 [2, points], phase from element to element and from slot to slot.
+        point: float64 [2, points], how much each counts, and the wanted response, real.
         beyond: bool [points], where the error is to be level; elsewhere it counts ``main_lobe`` times.
+        place: float64 [2, n], element and slot of every channel, from the middle.
+        index: int64 [2, n], the same, counted from 0.
+        pair: int64 [2, pairs], different differences of two channels in elements (not negative) and in slots.
+        of: int64 [n, n], which of them two channels have.
         main_lobe, ridge, level: as said; the ridge is relative to the mean over points.
         rounds: at most.
-        normal: float64 [n, n] scratch.
-        weight: float64 [2, n], receives the best weights, which sum to 1, and the last.
+        along, late: float64 [2, elements, points] and [4, slots, points] scratch.
+        line: float64 [6, points] scratch.
+        sums, normal: float64 [pairs] and [n, n] scratch.
+        weight: float64 [3, n], receives the best weights, which sum to 1, and the last; scratch.
     Returns:
         The maximum.
     """
-    points, n = len(wanted), rows.shape[1]
-    emphasis, error = np.empty(points), np.zeros(points)
+    points, share = len(beyond), point[0]
+    emphasis, error, part = line[0], line[1], line[2:]
+    best, w, right = weight[0], weight[1], weight[2]
     for p in range(points):
-        emphasis[p] = 1.0 if beyond[p] else main_lobe
+        emphasis[p] = (1.0 if beyond[p] else main_lobe) / points
+    _turns(step[0], along)
+    _turns(step[1], late)
+    _right_hand_side(step, share, point[1], place, emphasis, right)
     lowest = 1e30
-    best, w = weight[0], weight[1]
     for _ in range(rounds):
-        normal[:] = 0.0
-        w[:] = 0.0
-        for p in range(0, points, 2):
-            q = min(p + 1, points - 1)
-            share, other = emphasis[p] / points, emphasis[q] / points if q > p else 0.0
-            ar, ai, br, bi = rows[2 * p], rows[2 * p + 1], rows[2 * q], rows[2 * q + 1]
-            for i in range(n):
-                fr, fi, gr, gi = share * ar[i], share * ai[i], other * br[i], other * bi[i]
-                w[i] += fr * wanted[p] + gr * wanted[q]
-                line = normal[i]
-                for k in range(i + 1):
-                    line[k] += fr * ar[k] + fi * ai[k] + gr * br[k] + gi * bi[k]
-        for i in range(n):
+        _normal_matrix(along, late, share, emphasis, pair, of, sums, normal)
+        for i in range(len(w)):
             normal[i, i] += ridge
+            w[i] = right[i]
         _solve(normal, w)
         w /= w.sum()
+        _respond(along, late, share, index, w, part, error)
         largest = 0.0
         for p in range(points):
-            re, im = 0.0, 0.0
-            for i in range(n):
-                re += rows[2 * p, i] * w[i]
-                im += rows[2 * p + 1, i] * w[i]
-            error[p] = np.sqrt(re * re + im * im)
             largest = max(largest, error[p]) if beyond[p] else largest
         if largest < lowest:
             lowest = largest
-            for i in range(n):  # a copy of a slice would compile a second for its error message
+            for i in range(len(w)):  # a copy of a slice would compile a second for its error message
                 best[i] = w[i]
         if largest <= level:
             break
-        mean, count = 0.0, 0
-        for p in range(points):
-            if beyond[p]:
-                emphasis[p] *= KEPT_EMPHASIS + error[p] / largest
-                mean += emphasis[p]
-                count += 1
-        for p in range(points):
-            if beyond[p]:
-                emphasis[p] *= count / mean
+        _reweigh(error, beyond, largest, emphasis)
     return lowest

@@ -6,6 +6,9 @@ as c_g + c'_g (u - u_g), the tangent moved to the middle of the curve's bow: the
 slope moves each transmitter by 2 c'_g t along the array. The moved elements stand on no grid any more; they are spread
 on it (non-uniform FFT, Dutt and Rokhlin 1993) with weights that make up for their density, for one loop with weights
 of level lobes (beam_weights.py). Only v_x bends c(u), so travel along the array needs one sector at any speed.
+
+Level lobes of a new speed are solved for one sector a frame, the others keep the weights by density until it is their
+turn: no frame waits for more than one, and what comes out depends on the frames alone, not on any clock.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ DENSITY_REACH = 4
 DENSITY_SHARE = 0.75
 """Density counts by sinc^2(0.75 x), whose spectrum ends at 3/4 of the grid's period: the field of view."""
 ANGLE_LANES = 64
+SOLVES_A_FRAME = 1
+"""Sectors whose level lobes one frame may solve for: 1 to 2.5 ms."""
 STILL_CELLS = 0.02
 """Elements that move by less stay on the grid, which is exact in every direction."""
 
@@ -83,9 +88,10 @@ class Steering:
         loops, slots = time_s.shape
         self._fine = np.zeros((2, (bins + 2 * MARGIN) * FINE + len(self._density)))
         self._weight = np.zeros(loops * len(self._slot))
-        one_s, window = time_s[0, self._slot], tables.taper(settings, "angle", self.count, 0.5 * (self.count - 1))
-        one_s = one_s - 0.5 * (one_s.min() + one_s.max())
-        self._beam_weights = BeamWeights(self._position, one_s, window, geometry.pitch, wavelength_m)
+        window, slot_s = tables.taper(settings, "angle", self.count, 0.5 * (self.count - 1)), float(time_s[0, -1])
+        self.beam_weights = BeamWeights(
+            *(channels.element, channels.slot, slot_s / max(slots - 1, 1), window, geometry.pitch, wavelength_m)
+        )
         self._first = np.zeros((loops, len(self._slot)), dtype=np.int64)
         self._taps = zeros((loops, len(self._slot), TAPS))
         self._centred_s = np.zeros((loops, slots))
@@ -113,11 +119,15 @@ class Steering:
         loops: int,
         power: Float32,
         extra_m_s: float = 0.0,
+        solves: int = 0,
     ) -> BurstMotion:
         """Fill ``power`` [angle, range] from ``loops`` of ``cube`` [channel, loop, (re, im), range].
 
-        ``extra_m_s``: speed at which points in every direction come nearer besides.
-
+        Args:
+            cube, power: as said.
+            forward_m_s, along_m_s, loops: the motion, and the loops used.
+            extra_m_s: speed at which points in every direction come nearer besides.
+            solves: sectors whose level lobes may be solved for in this call.
         Returns:
             The motion, with the instant whose scene ``power`` shows.
         """
@@ -128,7 +138,9 @@ class Steering:
             across = math.sqrt(1.0 - sector.centre**2)
             slope_m_s = along_m_s - forward_m_s * sector.centre / across
             closing_m_s = sector_closing_m_s(sector, sector.centre, forward_m_s, along_m_s) + extra_m_s
-            weight = self._beam_weights.of(sector, forward_m_s, along_m_s) if loops == 1 else None
+            weight = self.beam_weights.known(sector, forward_m_s, along_m_s) if loops == 1 else None
+            if loops == 1 and weight is None and solves > 0:
+                weight, solves = self.beam_weights.of(sector, forward_m_s, along_m_s), solves - 1
             self._run_sector(cube, sector, closing_m_s, slope_m_s, loops, weight, power)
         return BurstMotion(middle_s, forward_m_s, along_m_s)
 

@@ -12,7 +12,9 @@ from edge.array import array_for
 from edge.calibration import Calibration
 from edge.config import Mounting
 from edge.devices import DeviceName
-from edge.frames import Layout, RadarId
+from edge.dsp.imager import Imager
+from edge.dsp.steering import MOST_SECTORS
+from edge.frames import Heatmap, Layout, RadarFrame, RadarId
 from edge.rig import Radar
 from edge.waveform import SPEED_OF_LIGHT_M_S, ChirpProfile, Schedule
 
@@ -59,3 +61,13 @@ def place(range_m: float, angle_deg: float, radar: str = "horizontal") -> list[f
     """Point in the plane of a radar's array, rig frame, array at the origin."""
     forward, along = range_m * np.cos(np.radians(angle_deg)), range_m * np.sin(np.radians(angle_deg))
     return [forward, along, 0.0] if radar == "horizontal" else [forward, 0.0, along]
+
+
+def settled(imager: Imager, frame: RadarFrame, velocity_rig_m_s: Any) -> Heatmap:
+    """Heatmap of the first frame at this velocity for which nothing was left to be solved for."""
+    for _ in range(MOST_SECTORS + 1):
+        before = imager._steering.beam_weights.solved
+        heatmap = imager.process(frame, np.array(velocity_rig_m_s))
+        if imager._steering.beam_weights.solved == before:
+            return heatmap
+    raise AssertionError("more frames than sectors")

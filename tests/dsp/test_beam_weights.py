@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dsp_radars import cascade_radar, place
+from dsp_radars import cascade_radar, place, settled
 
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp import tables, tdm
+from edge.dsp.beam_weights import channel_pairs
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.dsp.kernels_weights import level_lobes
@@ -54,7 +55,7 @@ def test_lobes_at_speed_are_within_1_db_of_rest(imagers, range_m, angles_deg):
         for velocity in (WALKING, FORWARD, ALONG, BACKWARD):
             if velocity == BACKWARD and window != "rectangular":
                 continue
-            moving = fine.process(frame_of(radar, range_m, angle_deg, velocity), np.array([*velocity, 0.0]))
+            moving = settled(fine, frame_of(radar, range_m, angle_deg, velocity), [*velocity, 0.0])
             assert highest_lobe_db(moving) < resting + 1.0, (velocity, angle_deg)
 
 
@@ -62,7 +63,7 @@ def test_against_the_array_gaps_leave_lobes(imagers):
     """Blocks of four elements drift apart to 1.47 elements: 0.75 wavelengths; low windows stay at -20 to -25 dB."""
     radar, _, fine, _ = imagers
     for angle_deg in (-40.0, -20.0, 0.0, 10.0, 35.0):
-        moving = fine.process(frame_of(radar, 6.0, angle_deg, BACKWARD), np.array([*BACKWARD, 0.0]))
+        moving = settled(fine, frame_of(radar, 6.0, angle_deg, BACKWARD), [*BACKWARD, 0.0])
         assert highest_lobe_db(moving) < (-17.0 if imagers[1] == "rectangular" else -20.0)
 
 
@@ -71,9 +72,7 @@ def test_places_are_within_a_twentieth_of_a_bin(imagers, velocity):
     radar, _, _, usual = imagers
     detector = Detector(radar, CfarSettings(kind="os"))
     for range_m, angle_deg in ((3.0, -20.0), (6.0, -40.0), (6.0, 0.0), (6.0, 10.0), (9.0, 35.0)):
-        found = detector.process(
-            usual.process(frame_of(radar, range_m, angle_deg, velocity), np.array([*velocity, 0.0]))
-        )
+        found = detector.process(settled(usual, frame_of(radar, range_m, angle_deg, velocity), [*velocity, 0.0]))
         assert abs(found.direction_cosine[0] - np.sin(np.radians(angle_deg))) < 0.05 * BIN
         assert abs(found.range_m[0] - range_m) < 1.5e-3
 
@@ -86,32 +85,96 @@ def test_noise_rises_by_1_5_db_at_most(imagers, velocity):
     resting = np.square(geometry.channel_weight(taper / taper.sum())).sum()
     steering = usual._steering
     for sector in steering.sectors(velocity[0], 1):
-        weight = steering._beam_weights.of(sector, *velocity)
+        weight = steering.beam_weights.of(sector, *velocity)
         assert weight.sum() == pytest.approx(1.0, abs=1e-9)
         assert np.square(weight).sum() < 10.0**0.15 * resting
 
 
+def solved(step, point, beyond, element, slot, main_lobe, ridge, rounds):
+    """Weights of channels at these elements and slots, and their highest lobe, by the kernel."""
+    index = np.stack((element, slot))
+    pair, of = channel_pairs(index)
+    elements, slots, points, n = element.max() + 1, slot.max() + 1, len(beyond), len(element)
+    weight, scratch = np.zeros((3, n)), (np.zeros((2, elements, points)), np.zeros((4, slots, points)))
+    place = index - 0.5 * np.array([[elements - 1.0], [slots - 1.0]])
+    highest = level_lobes(
+        *(step, point, beyond, place, index, pair, of, main_lobe, ridge, 0.0, rounds),
+        *(*scratch, np.zeros((6, points)), np.zeros(pair.shape[1]), np.zeros((n, n)), weight),
+    )
+    return highest, weight[0], np.exp(1j * step.T @ place) * point[0][:, None]
+
+
 def test_first_round_is_the_ridge_regression():
     rng = np.random.default_rng(5)
-    rows, wanted, beyond = rng.standard_normal((62, 9)), rng.standard_normal(31), rng.random(31) < 0.5
-    share = np.where(beyond, 1.0, 2.0) / 31
-    normal = np.einsum("p,pki,pkj->ij", share, rows.reshape(31, 2, 9), rows.reshape(31, 2, 9)) + 0.1 * np.eye(9)
-    expected = np.linalg.solve(normal, (share * wanted) @ rows[::2])
-    weight = np.zeros((2, 9))
-    highest = level_lobes(rows, wanted, beyond, 2.0, 0.1, 0.0, 1, np.zeros((9, 9)), weight)
-    np.testing.assert_allclose(weight[0], expected / expected.sum(), rtol=1e-9)
-    response = rows.reshape(31, 2, 9) @ weight[0]
-    assert highest == pytest.approx(np.linalg.norm(response, axis=1)[beyond].max(), rel=1e-9)
+    channels = [(e, s) for s in range(3) for e in (s, s + 1, s + 4)]
+    element, slot = np.array(channels).T
+    step, beyond = rng.uniform(-3.0, 3.0, (2, 31)), rng.random(31) < 0.5
+    point = np.stack((rng.uniform(0.2, 1.0, 31), np.where(beyond, 0.0, rng.random(31))))
+    highest, weight, rows = solved(step, point, beyond, element.copy(), slot.copy(), 2.0, 0.1, 1)
+    emphasis = np.where(beyond, 1.0, 2.0) / 31
+    normal = (rows.T * emphasis @ rows.conj()).real + 0.1 * np.eye(9)
+    expected = np.linalg.solve(normal, (emphasis * point.prod(axis=0)) @ rows.real)
+    np.testing.assert_allclose(weight, expected / expected.sum(), rtol=1e-9)
+    assert highest == pytest.approx(np.abs(rows @ weight)[beyond].max(), rel=1e-9)
 
 
 def test_more_rounds_level_the_lobes():
     """A uniform line of 16: the lowest equal lobes for a main lobe to the window's null are Dolph and Chebyshev's."""
     n, null = 16, 2.5 / 16
-    x, d = np.arange(n) - 7.5, np.linspace(null, 0.5, 200)
-    phase = 2.0 * np.pi * np.outer(np.r_[0.0, d], x)
-    rows = np.stack((np.cos(phase), np.sin(phase)), axis=1).reshape(-1, n)
+    step = np.stack((2.0 * np.pi * np.r_[0.0, np.linspace(null, 0.5, 200)], np.zeros(201)))
     beyond = np.arange(201) > 0
-    weight = np.zeros((2, n))
-    highest = level_lobes(rows, np.where(beyond, 0.0, 1.0), beyond, 2.0, 1e-6, 0.0, 200, np.zeros((n, n)), weight)
+    point = np.stack((np.ones(201), np.where(beyond, 0.0, 1.0)))
+    highest, _, _ = solved(step, point, beyond, np.arange(n), np.zeros(n, dtype=np.int64), 2.0, 1e-6, 200)
     chebyshev = 1.0 / np.cosh((n - 1) * np.arccosh(1.0 / np.cos(np.pi * null)))
     assert highest == pytest.approx(chebyshev, rel=0.05)
+
+
+def ramp_up(imager, frame, speeds_m_s):
+    """Powers of a frame seen at these speeds ahead, one after the other, and the sectors solved for in each."""
+    powers, solves = [], []
+    for speed_m_s in speeds_m_s:
+        before = imager._steering.beam_weights.solved
+        powers.append(imager.process(frame, np.array([speed_m_s, 0.0, 0.0])).power.copy())
+        solves.append(imager._steering.beam_weights.solved - before)
+    return powers, solves
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return frame_of(cascade_radar(), 6.0, 10.0, (5.0, 0.0))
+
+
+class TestNewSpeeds:
+    """Weights of a new speed are solved for one sector a frame, by the frames alone."""
+
+    def test_no_frame_waits_for_more_than_one_sector(self, frame):
+        speeds_m_s = [*np.linspace(1.0, 8.0, 25), *8 * [8.0]]
+        first, again = (Imager(cascade_radar(), HeatmapSettings(), FLAT) for _ in range(2))
+        powers, solves = ramp_up(first, frame, speeds_m_s)
+        assert max(solves) == 1
+        assert solves[-1] == 0
+        for one, other in zip(powers, ramp_up(again, frame, speeds_m_s)[0], strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_a_constant_speed_is_done_after_as_many_frames_as_sectors(self, frame):
+        imager = Imager(cascade_radar(), HeatmapSettings(), FLAT)
+        sectors = imager._steering.sectors(8.0, 1)
+        powers, solves = ramp_up(imager, frame, (len(sectors) + 3) * [8.0])
+        assert solves == [1] * len(sectors) + 3 * [0]
+        for n, sector in enumerate(sectors):
+            done, waiting = slice(sector.first, sector.last), slice(sector.last, None)
+            np.testing.assert_array_equal(powers[n][done], powers[-1][done])
+            assert waiting.start == len(powers[n]) or (powers[n][waiting] != powers[-1][waiting]).any()
+
+    def test_along_the_array_the_first_frame_is_the_last_word(self, frame):
+        imager = Imager(cascade_radar(), HeatmapSettings(), FLAT)
+        powers = [imager.process(frame, np.array([0.0, 8.0, 0.0])).power.copy() for _ in range(2)]
+        np.testing.assert_array_equal(*powers)
+        assert imager._steering.beam_weights.solved == 1
+
+    def test_several_maps_of_a_frame_solve_once(self):
+        imager = Imager(cascade_radar(), HeatmapSettings(), FLAT)
+        frame = make_frame(cascade_radar(), [place(6.0, 10.0)], 1e3, 0, 0)
+        for n in range(3):
+            assert imager.process(frame, np.array([5.0, 0.0, 2.0])).maps > 1
+            assert imager._steering.beam_weights.solved == n + 1

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dsp_radars import cascade_radar, place, single_chip_radar
+from dsp_radars import cascade_radar, place, settled, single_chip_radar
 
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp import tdm
@@ -35,7 +35,7 @@ def seen(imager, radar, angle_deg, velocity, range_m=6.0, amplitude=1e3, **optio
     velocity_rig = np.array([*velocity, 0.0])
     point = [place(range_m, angle_deg)]
     frame = make_frame(radar, point, amplitude, 0, 0, velocity_rig_m_s=velocity_rig, **options)
-    return imager.process(frame, velocity_rig)
+    return settled(imager, frame, velocity_rig)
 
 
 def sidelobe_db(power):
@@ -120,9 +120,9 @@ def test_steered_power_agrees_with_the_definition(loops, velocity):
     imager = Imager(radar, settings, AntennaSettings())
     points, velocity_rig = [place(6.0, -40.0), place(4.0, 10.0)], np.array([*velocity, 0.0])
     frame = make_frame(radar, points, 1e3, 0, 0, velocity_rig_m_s=velocity_rig, noise_lsb=25.0)
-    power = imager.process(frame, velocity_rig).power
+    power = settled(imager, frame, velocity_rig).power
     sectors = [(s.centre, s.half_width, s.first, s.last) for s in imager._steering.sectors(velocity[0], loops)]
-    beam_weights, used = imager._steering._beam_weights, imager._steering.sectors(velocity[0], loops)
+    beam_weights, used = imager._steering.beam_weights, imager._steering.sectors(velocity[0], loops)
     weights = [beam_weights.of(sector, *velocity) for sector in used] if loops == 1 else []
     expected = steered_power(radar, frame, settings, AntennaSettings(), loops, velocity, sectors, weights)
     rows = np.abs(imager.direction_cosine) < tdm.FOV_COSINE

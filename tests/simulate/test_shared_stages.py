@@ -13,7 +13,7 @@ from edge.dsp.imager import Imager
 from edge.errors import ConfigError
 from edge.reference.point_targets import make_frame
 from edge.rig import Radar, Rig, load_rig
-from train.simulate.stages import KEPT, CalibratedImager, SharedStages
+from train.simulate.stages import KEPT, SharedStages
 
 RNG = np.random.default_rng(3)
 
@@ -32,12 +32,12 @@ def with_boards(rig: Rig) -> Rig:
 def test_an_exchanged_calibration_gives_the_heatmap_of_a_fresh_imager(name: str) -> None:
     rig = load_rig(name)
     first, second = mismatched(rig.radars["horizontal"]), mismatched(rig.radars["horizontal"])
-    imager = CalibratedImager(first, rig.settings.heatmap, rig.settings.antenna)
+    imager = Imager(first, rig.settings.heatmap, rig.settings.antenna)
     calibration = second.calibration
     ramp = calibration.range_shift_bins
     frame = make_frame(second, [[3.0, 0.5, 0.0]], 500.0, 0, 0, None, 5.0, None, 1.0 / calibration.gain, ramp)
     for board in (first, second):
-        imager.calibrate(board.calibration)
+        imager.recalibrate(board.calibration)
         expected = Imager(board, rig.settings.heatmap, rig.settings.antenna).process(frame).power
         power = imager.process(frame).power
         np.testing.assert_allclose(power, expected, rtol=2e-3, atol=1e-6 * float(expected.max()))
@@ -46,9 +46,9 @@ def test_an_exchanged_calibration_gives_the_heatmap_of_a_fresh_imager(name: str)
 def test_another_reference_range_is_refused() -> None:
     rig = load_rig("cascade_demo")
     board = rig.radars["vertical"]
-    imager = CalibratedImager(board, rig.settings.heatmap, rig.settings.antenna)
+    imager = Imager(board, rig.settings.heatmap, rig.settings.antenna)
     with pytest.raises(ConfigError, match="reference_range_m"):
-        imager.calibrate(replace(board.calibration, reference_range_m=5.0))
+        imager.recalibrate(replace(board.calibration, reference_range_m=5.0))
 
 
 def test_boards_alike_share_and_what_is_old_goes() -> None:

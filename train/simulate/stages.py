@@ -8,13 +8,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import replace
 from typing import TypeVar
 
-import numpy as np
-
-from edge.calibration import Calibration
-from edge.config import AntennaSettings, HeatmapSettings, require
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
 from edge.frames import RadarId
@@ -24,39 +19,6 @@ from train.simulate.synthesis import Synthesizer
 T = TypeVar("T")
 KEPT = 24
 """Imagers, detectors and synthesizers that are kept, those used last."""
-
-
-class CalibratedImager(Imager):
-    """An imager that takes another calibration of the same board between two frames; all other tables stay.
-
-    Args:
-        radar: its calibration sets the reference range only.
-        settings, antenna: as of ``Imager``.
-    """
-
-    def __init__(self, radar: Radar, settings: HeatmapSettings, antenna: AntennaSettings) -> None:
-        shape = radar.calibration.gain.shape
-        self._reference_m = radar.calibration.reference_range_m
-        plain = Calibration(np.ones(shape, np.complex64), np.zeros(shape), self._reference_m)
-        super().__init__(replace(radar, calibration=plain), settings, antenna)
-        self._taper = self._window[:, 0].copy()
-
-    def calibrate(self, calibration: Calibration) -> None:
-        """Use ``calibration`` from the next frame on.
-
-        Raises:
-            ConfigError: another reference range, on which the focusing tables depend.
-        """
-        reference_m = calibration.reference_range_m
-        require(reference_m == self._reference_m, "calibration.reference_range_m", reference_m, str(self._reference_m))
-        samples, rx = self.layout.samples, self.layout.rx
-        turns = calibration.range_shift_bins[..., None] * (np.arange(samples) / samples)
-        channel = np.asarray(calibration.gain)[..., None] * np.exp(-2j * np.pi * turns).astype(np.complex64)
-        for block, (slot, device) in enumerate(self._pairs):
-            values = channel[slot, device * rx : (device + 1) * rx].T.reshape(-1)
-            taper = self._taper[block, : len(values)]
-            self._window[block, 0, : len(values)] = taper * values.real
-            self._window[block, 1, : len(values)] = taper * values.imag
 
 
 class SharedStages:
@@ -82,8 +44,8 @@ class SharedStages:
     def _pair(self, board: Radar, rig: Rig) -> tuple[Imager, Detector]:
         settings = rig.settings
         key = (*_board(board), board.calibration.reference_range_m, settings.heatmap, settings.antenna)
-        imager = self._get((Imager, *key), lambda: CalibratedImager(board, settings.heatmap, settings.antenna))
-        imager.calibrate(board.calibration)
+        imager = self._get((Imager, *key), lambda: Imager(board, settings.heatmap, settings.antenna))
+        imager.recalibrate(board.calibration)
         return imager, self._get((Detector, *key, settings.cfar), lambda: Detector(board, settings.cfar))
 
     def _get(self, key: Hashable, make: Callable[[], T]) -> T:
