@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numba.core import event
@@ -55,6 +57,30 @@ def test_the_first_frame_finds_everything_ready(monkeypatch: pytest.MonkeyPatch)
     assert recorder.buffer == []
     assert len(results.frames) == 2
     assert all(pipeline.ledgers[radar].snapshot().frames_ok == 2 for radar in RADARS)
+
+
+def test_speeding_up_sideways_makes_no_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 0 to 8 m/s every number of maps occurs, 1 to 33; the factors of each are ready."""
+    results = Results()
+    pipeline = Pipeline(RIG, None, [results])
+    pipeline.rehearse(noise_frames(RIG, 0, 0))
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a table was made by a real frame")
+
+    monkeypatch.setattr(RingTables, "of", refuse)
+    maps, left_m = set(), 0.0
+    for number in range(1, 35):
+        t_ns = number * PERIOD_NS
+        left_m += 8.2 * (number - 1) / 33 * PERIOD_NS * 1e-9
+        pipeline.feed(Pose(t_ns, np.array([0.0, left_m, 0.8]), np.array([0.0, 0.0, 0.0, 1.0])))
+        for frame in noise_frames(RIG, 0, t_ns).values():
+            pipeline.feed(replace(frame, number=number))
+    pipeline.finish()
+    for result in results.frames:
+        maps |= {heatmap.maps for heatmap in result.heatmaps.values()}
+    assert len(results.frames) >= 33
+    assert {1, 3, 5, 15, 31} <= maps
 
 
 def test_the_same_number_gives_the_same_noise() -> None:
