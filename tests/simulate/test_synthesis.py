@@ -212,9 +212,13 @@ def ahead(radar: Radar, range_m: float) -> Any:
     return np.array(radar.mounting.position_m) + np.array([range_m, 0.0, 0.0])
 
 
-def array_cut(range_m: float, focus: bool) -> tuple[float, float, float]:
-    """Highest sidelobe in dB, range and half-power width in degrees of a boresight point, rectangular windows."""
+def array_cut(range_m: float, focus: bool, reference_m: float = np.inf) -> tuple[float, float, float]:
+    """Highest sidelobe in dB, range and half-power width in degrees of a boresight point, rectangular windows.
+
+    ``reference_m``: of the reflector whose wavefront the calibration holds.
+    """
     radar = cascade()
+    radar = replace(radar, calibration=FrontEnd(radar, FrontEndSettings.ideal(), 0).calibration(reference_m))
     settings = HeatmapSettings(
         range_window="rectangular", angle_window="rectangular", angle_bins=1024, focus=focus, doppler="single"
     )
@@ -280,6 +284,45 @@ def test_unfocused_sidelobes_are_those_of_the_spherical_wave(range_m: float) -> 
     expected_db = row_sidelobe_db(row, radar.array.pitch_wavelengths(radar.schedule.profile.center_frequency_hz))
     assert found_db == pytest.approx(expected_db, abs=0.15)
     assert found_db > -12.3
+
+
+@pytest.mark.parametrize(("range_m", "table_db"), [(3.0, -11.6), (10.0, -12.0), (13.5, -11.6)])
+def test_a_calibration_at_five_metres_bakes_its_wavefront_in(range_m: float, table_db: float) -> None:
+    """Validation table, row 3 (whose last figure is for 15 m): what a reflector at 5 m leaves, until it is focused."""
+    radar = cascade()
+    found_db, place_m, _ = array_cut(range_m, focus=False, reference_m=5.0)
+    position, phasors = radar.array.position, channel_phasors(radar, place_m) / channel_phasors(radar, 5.0)
+    row = [phasors[position == element].mean() for element in range(radar.array.count)]
+    expected_db = row_sidelobe_db(row, radar.array.pitch_wavelengths(radar.schedule.profile.center_frequency_hz))
+    assert found_db == pytest.approx(expected_db, abs=0.15)
+    assert found_db == pytest.approx(table_db, abs=0.8)
+    assert array_cut(range_m, focus=True, reference_m=5.0)[0] == pytest.approx(-13.26, abs=0.12)
+
+
+@pytest.mark.parametrize(("phase_deg", "table_db"), [(0.0, 0.1), (90.0, 2.0), (135.0, 8.0), (180.0, 44.0)])
+def test_whether_two_points_1_4_degrees_apart_are_two_peaks_is_a_matter_of_their_phase(
+    phase_deg: float, table_db: float
+) -> None:
+    """Validation table, row 9: the dip between them, against the pattern of a uniform line."""
+    radar = cascade()
+    sine, range_m = np.sin(np.radians(0.7)), 84 * radar.schedule.profile.range_bin_m
+    across = range_m * np.array([[np.sqrt(1 - sine**2), sine, 0.0], [np.sqrt(1 - sine**2), -sine, 0.0]])
+    level = 500.0 * np.exp(1j * np.radians([phase_deg, 0.0]))
+    frame = ideal_frame(radar, Scatterers.direct(across + radar.mounting.position_m, level.astype(np.complex64)))
+    settings = HeatmapSettings(range_window="rectangular", angle_window="rectangular", angle_bins=4096)
+    heatmap = Imager(radar, settings, PAIR.settings.antenna).process(frame)
+    pitch = radar.array.pitch_wavelengths(radar.schedule.profile.center_frequency_hz)
+    cosine = heatmap.direction_cosine.astype(float)
+    place = 2j * np.pi * pitch * (np.arange(radar.array.count) - 0.5 * (radar.array.count - 1))
+    field = [level[k] * np.exp(np.outer(cosine - u, place)).sum(axis=1) for k, u in enumerate((sine, -sine))]
+
+    def dip_db(power: Any) -> float:
+        peaks = [power[side & (abs(cosine) < 0.03)].max() for side in (cosine >= 0, cosine <= 0)]
+        return float(10 * np.log10(min(peaks) / power[np.argmin(abs(cosine))]))
+
+    found_db, expected_db = dip_db(heatmap.power[:, 84]), dip_db(abs(field[0] + field[1]) ** 2)
+    assert min(found_db, 44.0) == pytest.approx(min(expected_db, 44.0), abs=0.1)
+    assert min(found_db, 44.0) == pytest.approx(table_db, abs=0.4)
 
 
 @pytest.mark.parametrize(("range_m", "expected_db"), [(3.0, -9.5), (5.0, -10.9), (10.0, -12.0), (13.6, -12.4)])
