@@ -69,7 +69,7 @@ def test_gradient_of_the_short_form_equals_the_written_out_one() -> None:
     points = cloud(200).double()
     gradients = []
     for output in (network(points, [200]), written_out(network, points)):
-        loss = sum(part.flatten()[: 3 * COARSE_POINTS].sin().sum() for part in output)
+        loss = sum(part.flatten()[: 3 * COARSE_POINTS].sin().sum() for part in output[:3])
         network.zero_grad()
         loss.backward()
         gradients.append(torch.cat([p.grad.flatten() for p in network.parameters()]))
