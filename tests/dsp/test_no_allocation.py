@@ -1,43 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steady frames allocate nothing in kernels and keep nothing in Python."""
+"""Steady frames of one radar allocate nothing in kernels and keep nothing in Python, whatever becomes of the loops."""
 
 from __future__ import annotations
 
-import tracemalloc
-
 import numpy as np
 import pytest
+from allocations import check_kernels, check_python
 from dsp_radars import cascade_radar, place
-from numba import types
-from numba.core.runtime import _nrt_python, rtsys
 
 from edge.config import AntennaSettings, CfarSettings, HeatmapSettings
 from edge.dsp.detector import Detector
 from edge.dsp.imager import Imager
-from edge.dsp.kernels_cfar import mean_peaks
-from edge.dsp.kernels_checks import all_zero, dead_channels
-from edge.dsp.kernels_detect import drop_sidelobes, refine, strongest
-from edge.dsp.kernels_doppler import (
-    doppler_fft,
-    doppler_row,
-    keep_larger,
-    plan_spreading,
-    resolve_folds,
-    set_turns,
-    spread,
-)
-from edge.dsp.kernels_heatmap import set_phasors
 from edge.reference.point_targets import make_frame
 
 LARGEST_TEMPORARY_BYTES = 32768
 """Far below any plane of the road: a heatmap has 262,144 bytes."""
-
-
-MOTION = {"sum": [0.0, 0.0, 0.0], "moved sum": [0.05, 0.1, 0.0], "steer": [0.0, 3.0, 0.0], "fft": [0.5, 3.0, 0.0]}
+MOTION = {
+    "sum": [0.0, 0.0, 0.0],
+    "moved sum": [0.05, 0.1, 0.0],
+    "several maps single": [0.0, 0.0, 2.0],
+    "steer": [0.0, 3.0, 0.0],
+    "fft": [0.5, 3.0, 0.0],
+}
 """What is done with the loops -> velocity of the rig."""
+KERNELS = {
+    "sum": {"set_phasors"},
+    "several maps single": {"set_phasors", "keep_strongest", "give_to_owners"},
+    "moved sum": {"plan_spreading", "set_turns", "spread"},
+    "steer": {"plan_spreading", "set_turns", "spread"},
+    "fft": {"doppler_fft", "resolve_folds", "doppler_row", "keep_larger"},
+}
+"""What is done with the loops -> kernels that only this needs."""
+ALWAYS = {"all_zero", "dead_channels", "strongest", "drop_sidelobes", "refine"}
 
 
-@pytest.fixture(params=[("ca", "moved sum"), ("so", "sum"), ("os", "sum"), ("ca", "steer"), ("ca", "fft")])
+ROADS = [("ca", way) for way in MOTION if way != "sum"] + [("so", "sum"), ("os", "sum")]
+
+
+@pytest.fixture(params=ROADS, ids=str)
 def road(request):
     kind, way = request.param
     radar = cascade_radar(loops=2)
@@ -56,52 +56,12 @@ def road(request):
     return way, imager, detector, run
 
 
-def motion_kernels(way, imager):
-    """Kernels between the range FFT and the power of one frame of two loops, in one sector."""
-    steering, doppler = imager._steering, imager._doppler
-    steered = [plan_spreading, set_turns, spread, steering._angle_kernels[0]]
-    by_bin = [resolve_folds, doppler_row, doppler._angle_kernel, keep_larger]
-    return {
-        "sum": [set_phasors, imager._row_kernel, imager._angle_kernel],
-        "moved sum": [imager._channel_kernel, *steered],
-        "steer": [imager._range_kernel, *2 * [imager._channel_kernel], *steered],
-        "fft": [imager._range_kernel, *2 * [imager._channel_kernel], doppler_fft, *2 * by_bin],
-    }[way]
-
-
-def array_arguments(kernel):
-    """Arrays a call hands over; Numba counts one small descriptor for each."""
-    (signature,) = kernel.nopython_signatures
-    return sum(isinstance(argument, types.Array) for argument in signature.args)
-
-
-def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(road):
+def test_kernels_allocate_nothing_beyond_the_descriptors_of_their_arguments(road, monkeypatch):
     way, imager, detector, run = road
-    kernels = [all_zero, dead_channels, imager._range_kernel, strongest, drop_sidelobes, refine]
-    kernels += motion_kernels(way, imager)
-    ranks = detector.settings.kind == "os"
-    kernels += [detector._rank_peaks, detector._rank_noise] if ranks else [detector._ring_noise, mean_peaks]
-    _nrt_python.memsys_enable_stats()
-    try:
-        before = rtsys.get_allocation_stats()
-        run(20)
-        after = rtsys.get_allocation_stats()
-    finally:
-        _nrt_python.memsys_disable_stats()
-    assert after.alloc - before.alloc == 20 * sum(array_arguments(kernel) for kernel in kernels)
-    assert after.free - before.free == after.alloc - before.alloc
+    seen = set(check_kernels(run, 20, (imager, detector), monkeypatch))
+    assert seen >= ALWAYS | KERNELS[way] | ({"mean_peaks"} if detector.settings.kind != "os" else set())
+    assert not seen & (set().union(*KERNELS.values()) - KERNELS[way])
 
 
 def test_python_keeps_nothing_and_makes_no_large_temporary(road):
-    run = road[-1]
-    tracemalloc.start()
-    try:
-        run(5)
-        start = tracemalloc.get_traced_memory()[0]
-        tracemalloc.reset_peak()
-        run(30)
-        end, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert end - start < 2048
-    assert peak - start < LARGEST_TEMPORARY_BYTES
+    check_python(road[-1], 30, 2048, LARGEST_TEMPORARY_BYTES)
