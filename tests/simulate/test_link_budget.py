@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge.config import AntennaSettings
 from edge.errors import ConfigError
-from train.simulate.link_budget import LinkSettings, amplitude_per_rcs, antenna_amplitude, snr_db
+from train.simulate.link_budget import LinkSettings, amplitude_per_rcs, snr_db
 
 WAVELENGTH_M = 299_792_458.0 / 78.74e9
 
@@ -37,15 +36,3 @@ def test_amplitude_scales_with_the_noise_it_is_measured_in() -> None:
 def test_impossible_budgets_are_refused(key: str, value: float) -> None:
     with pytest.raises(ConfigError, match=key):
         LinkSettings(**{key: value})
-
-
-def test_pattern_falls_in_both_planes_and_turns_with_the_board() -> None:
-    antenna = AntennaSettings(along_edge_deg=70.0, along_loss_db=6.0, across_edge_deg=20.0, across_loss_db=6.0)
-    tilt = np.radians(20.0)
-    ahead, up = np.array([1.0, 0.0, 0.0]), np.array([np.cos(tilt), 0.0, np.sin(tilt)])
-    gain_db = {
-        radar: 20 * np.log10(antenna_amplitude(antenna, radar, np.stack((ahead, up))))
-        for radar in ("horizontal", "vertical")
-    }
-    np.testing.assert_allclose(gain_db["horizontal"], [0.0, -6.0], atol=1e-6)
-    np.testing.assert_allclose(gain_db["vertical"], [0.0, -6.0 * (20 / 70) ** 2], atol=1e-6)

@@ -7,6 +7,7 @@ import numpy as np
 
 from edge.frames import Complex64, Float32, Float64
 from train.simulate.ground import GroundSettings
+from train.simulate.points import board_factors
 
 
 class GroundClutter:
@@ -29,8 +30,7 @@ class GroundClutter:
         phase = np.exp(2j * np.pi * rng.random(count))
         self.weight: Complex64 = (np.sqrt(sigma_m2 * rng.exponential(1.0, count)) * phase).astype(np.complex64)
         """sqrt(sigma) exp(j phase), m, complex64 [c]."""
-        half = rng.normal(0.0, imbalance_db, count) / 40.0
-        self.board: Float32 = np.stack([10.0**half, 10.0**-half], axis=1).astype(np.float32)
+        self.board: Float32 = board_factors(rng.normal(0.0, imbalance_db, count))
         """Amplitude factors of the boards, float32 [c, 2]."""
 
     def around(self, position_m: Float64) -> Float32:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge.frames import Complex64, Float32, Float64
 from train.objects.sampling import Int32
+from train.simulate.ground import mirror
 from train.simulate.kernels_optics import DIRECT, GROUND, MIXED, UInt8
 
 NEAREST_M = 0.1
@@ -47,16 +48,14 @@ def _legs(
         leg = 10.0 ** (-_loss_db(x / direct, y / direct, z / direct, pattern) / 20.0) / direct
         if path == DIRECT:
             return leg * leg, direct
-    height, permittivity = ground[3], abs(ground[4])
+    height = ground[3]
     above = ground[0] * x + ground[1] * y + ground[2] * z + height
     mx, my, mz = x - 2.0 * above * ground[0], y - 2.0 * above * ground[1], z - 2.0 * above * ground[2]
     if mx <= 0.0 or above <= 0.0:
         return 0.0, np.inf
     image = math.sqrt(mx * mx + my * my + mz * mz)
     sine = (above + height) / image
-    root = math.sqrt(permittivity - 1.0 + sine * sine)
-    numerator = sine if ground[4] < 0.0 else permittivity * sine
-    gamma = (numerator - root) / (numerator + root) * math.exp(-2.0 * ground[5] * sine * sine)
+    gamma = mirror(sine, abs(ground[4]), ground[4] < 0.0, ground[5])
     mirrored = gamma * 10.0 ** (-_loss_db(mx / image, my / image, mz / image, pattern) / 20.0) / image
     if path == MIXED:
         return leg * mirrored, 0.5 * (direct + image)

@@ -11,11 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from edge.config import AntennaSettings, require
-from edge.dsp.antenna import across_loss_db, along_loss_db
-from edge.frames import Float64, RadarId
+from edge.config import require
 
 BOLTZMANN_J_K = 1.380649e-23
 
@@ -81,18 +77,3 @@ def amplitude_per_rcs(link: LinkSettings, wavelength_m: float, noise_lsb: float)
     power_w = 1e-3 * math.pow(10.0, 0.1 * link.tx_power_dbm + 0.2 * link.gain_dbi)
     received_w = power_w * wavelength_m**2 / (4.0 * math.pi) ** 3
     return noise_lsb * math.sqrt(received_w / noise_power_w(link))
-
-
-def antenna_amplitude(antenna: AntennaSettings, radar: RadarId, direction: Float64) -> Float64:
-    """One-way amplitude of one antenna towards given directions; a radar echo takes it twice.
-
-    Args:
-        antenna: loss by angle along and across the radar's own array.
-        radar: the horizontal radar's array lies along rig y, the vertical one's along rig z.
-        direction: float64 [k, 3], unit vectors from the board in rig axes.
-    Returns:
-        float64 [k], 1 on boresight.
-    """
-    along, across = (1, 2) if radar == "horizontal" else (2, 1)
-    loss_db = along_loss_db(antenna, direction[:, along]) + across_loss_db(antenna, direction[:, across])
-    return np.asarray(10.0 ** (-loss_db / 20.0))

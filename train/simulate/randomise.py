@@ -20,8 +20,6 @@ from train.simulate.surface_settings import SurfaceSettings
 
 Range = tuple[float, float]
 FRAME_PERIOD_S = 1.0 / 60.0
-CLUTTER_POINTS = 8192
-"""Eight a square metre: fewer would stand out one by one, as no ground does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +184,6 @@ def draw(ranges: Ranges, seed: int, frame_period_s: float = FRAME_PERIOD_S) -> S
                 enabled=take.happens("ground_share"),
                 permittivity=take.uniform("permittivity"),
                 roughness_m=take.log_uniform("ground_roughness_m"),
-                clutter_points=CLUTTER_POINTS,
                 clutter_db=take.uniform("clutter_db"),
             )
         ),

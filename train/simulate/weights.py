@@ -198,4 +198,4 @@ class Weigher:
         rise_m = float(middle_m[2] - eye_m[3])
         ground = self._settings.ground
         sine = rise_m / max(float(np.hypot(flat_m, rise_m)), 1e-9)
-        return abs(float(ground_reflection(sine, ground.permittivity, "H", ground.roughness_m, self._wavelength_m)))
+        return abs(ground_reflection(sine, ground.permittivity, "H", ground.roughness_m, self._wavelength_m))
