@@ -43,7 +43,7 @@ class Trust(NamedTuple):
 def measures(
     points_m: Float32,
     fine_m: Float32,
-    probability: Sequence[float] | Float32,
+    probability: Sequence[float] | Float32 | None,
     frames: int,
     sigma_m: float | None = None,
 ) -> dict[str, float]:
@@ -52,7 +52,7 @@ def measures(
     Args:
         points_m: float32 [n, 3], n >= 1, what the network saw; z up, ground 0, metres.
         fine_m: float32 [m, 3], m >= 1, its answer in the same frame.
-        probability: of the classes, in the manifest's order.
+        probability: of the classes, in the manifest's order; None: the network has no classifier.
         frames: of the window.
         sigma_m: the network's own mean uncertainty of a point, where it gives one.
     Returns:
@@ -69,13 +69,10 @@ def measures(
     back = np.sqrt(squared.min(axis=0))
     low, high = np.quantile(points_m[:, 2], (0.05, 0.95))
     long_m, wide_m = _axes(points_m)
-    chance = np.asarray(probability, dtype=np.float64)
-    top = float(np.clip(chance.max(), 1e-6, 1 - 1e-6))
     result = {
         "points": math.log2(len(points_m) / 256),
         "frames": math.log2(min(max(frames, 1), FULL_WINDOW_FRAMES) / FULL_WINDOW_FRAMES),
-        "odds": min(_ODDS_LIMIT, math.log(top / (1 - top))),
-        **{f"p{number}": float(value) for number, value in enumerate(chance)},
+        **({} if probability is None else _of_classes(np.asarray(probability, dtype=np.float64))),
         "near": float((forth < NEAR_M).mean()),
         "away_m": float(np.minimum(forth, _FAR_M).mean()),
         "seen": float((back < SEEN_M).mean()),
@@ -87,6 +84,12 @@ def measures(
         "answer_high_m": float(np.quantile(surface[:, 2], 0.95)),
     }
     return result if sigma_m is None else result | {"sigma_m": sigma_m}
+
+
+def _of_classes(probability: Float64) -> dict[str, float]:
+    top = float(np.clip(probability.max(), 1e-6, 1 - 1e-6))
+    each = {f"p{number}": float(value) for number, value in enumerate(probability)}
+    return {"odds": min(_ODDS_LIMIT, math.log(top / (1 - top)))} | each
 
 
 def _some(cloud: Float32, most: int) -> Float32:
