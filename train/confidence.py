@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge.completion.confidence import HEADS, ConfidenceModel, Trust, basis, measures
+from edge.completion.confidence import ConfidenceModel, Trust, measures, quadratic, standardised
 from edge.completion.model import UNKNOWN
 from edge.config import require
 from edge.frames import Float64
@@ -100,14 +100,15 @@ def fit_confidence(seen: Observations, limit_m: float = SHAPE_LIMIT_M) -> Confid
     values = np.array([[one[name] for name in names] for one in seen.measured])
     mean, scale = values.mean(axis=0), values.std(axis=0)
     scale = np.where(scale > 1e-9, scale, 1.0)
-    terms = basis(values, mean, scale)
+    terms = quadratic(standardised(values, mean, scale))
+    linear = terms[seen.known, : 1 + len(names)]
     weight = np.where(seen.known, 1.0, CLUTTER_SHARE / (1 - CLUTTER_SHARE) * objects / others)
     heads = {
-        "shape": logistic_fit(terms[seen.known], seen.cd_m[seen.known] < limit_m),
-        "class": logistic_fit(terms[seen.known], seen.right[seen.known]),
+        "shape": logistic_fit(linear, seen.cd_m[seen.known] < limit_m),
+        "class": logistic_fit(linear, seen.right[seen.known]),
         "known": logistic_fit(terms, seen.known, weight),
     }
-    rounded = {head: tuple(float(f"{value:.6g}") for value in heads[head]) for head in HEADS}
+    rounded = {head: tuple(float(f"{value:.6g}") for value in weights) for head, weights in heads.items()}
     middle, width = (tuple(float(f"{value:.6g}") for value in column) for column in (mean, scale))
     model = ConfidenceModel(names, middle, width, rounded, 0.0, limit_m)
     named = [model.trust(one).class_right for one, known in zip(seen.measured, seen.known, strict=True) if not known]

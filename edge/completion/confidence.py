@@ -23,7 +23,7 @@ _INPUT_ROWS, _SURFACE_ROWS = 256, 2048
 _CUT = 4.0
 """Standardised measures are cut here: nothing is extrapolated far beyond the fit."""
 _ODDS_LIMIT = 6.0
-_FAR_M = 1.0
+_FAR_M, _LEAST_M = 1.0, 0.02
 
 
 class Trust(NamedTuple):
@@ -58,10 +58,11 @@ def measures(
     Returns:
         Name -> number: ``points`` and ``frames`` (log2 against 256 points and a full window, the latter at most 0),
         ``odds`` (log-odds of the most probable class), ``p0``, ``p1`` .. (class probabilities), ``near`` (share of
-        input points within 10 cm of the answer), ``away_m`` (mean distance of input points from it, each at most 1 m),
-        ``seen`` (share of the answer within 30 cm of an input point), ``long_m``, ``wide_m`` (standard deviations of
-        the input along its horizontal principal axes), ``low_m``, ``high_m`` (5 % and 95 % quantiles of its heights),
-        ``answer_long_m``, ``answer_high_m`` (the same of the answer), and ``sigma_m`` where given.
+        input points within 10 cm of the answer), ``seen`` (share of the answer within 30 cm of an input point),
+        ``low_m`` (5 % quantile of the input's heights), and as log2 of metres, at least 2 cm: ``away`` (mean distance
+        of input points from the answer, each at most 1 m), ``long``, ``wide`` (standard deviations of the input along
+        its horizontal principal axes), ``high`` (95 % quantile of its heights), ``answer_long``, ``answer_high`` (the
+        same of the answer), ``sigma`` where given.
     """
     rows, surface = _some(points_m, _INPUT_ROWS), _some(fine_m, _SURFACE_ROWS)
     squared = _squared_distances(rows, surface)
@@ -74,16 +75,20 @@ def measures(
         "frames": math.log2(min(max(frames, 1), FULL_WINDOW_FRAMES) / FULL_WINDOW_FRAMES),
         **({} if probability is None else _of_classes(np.asarray(probability, dtype=np.float64))),
         "near": float((forth < NEAR_M).mean()),
-        "away_m": float(np.minimum(forth, _FAR_M).mean()),
         "seen": float((back < SEEN_M).mean()),
-        "long_m": long_m,
-        "wide_m": wide_m,
         "low_m": float(low),
-        "high_m": float(high),
-        "answer_long_m": _axes(surface)[0],
-        "answer_high_m": float(np.quantile(surface[:, 2], 0.95)),
+        "away": _log(float(np.minimum(forth, _FAR_M).mean())),
+        "long": _log(long_m),
+        "wide": _log(wide_m),
+        "high": _log(float(high)),
+        "answer_long": _log(_axes(surface)[0]),
+        "answer_high": _log(float(np.quantile(surface[:, 2], 0.95))),
     }
-    return result if sigma_m is None else result | {"sigma_m": sigma_m}
+    return result if sigma_m is None else result | {"sigma": _log(sigma_m)}
+
+
+def _log(length_m: float) -> float:
+    return math.log2(max(length_m, _LEAST_M))
 
 
 def _of_classes(probability: Float64) -> dict[str, float]:
@@ -117,12 +122,16 @@ def _axes(cloud: Float32) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class ConfidenceModel:
-    """Three logistic models over standardised measures z and their squares, each cut at 4 standard deviations.
+    """Three logistic models over standardised measures z, each cut at 4 standard deviations.
+
+    Shape and class are linear in z; "known" also has all products of two, because what is odd is the combination: as
+    narrow as a pole and yet a pedestrian.
 
     Args:
         names: measures that are used, in order.
         mean, scale: of each over the data of the fit.
-        heads: "shape", "class", "known" -> weights: a constant, one for every z, one for every z squared.
+        heads: "shape", "class" -> a constant and one weight for every z; "known" -> these, and one for every product
+            z_i z_j, i <= j, in the order of ``quadratic``.
         unknown_below: below this probability of the right class the class is "unknown".
         shape_limit_m: what "shape" promises.
     """
@@ -146,8 +155,9 @@ class ConfidenceModel:
         if not np.isfinite(values).all():
             missing = [name for name, value in zip(self.names, values, strict=True) if not math.isfinite(value)]
             raise ModelError(f"confidence: no value of {', '.join(missing)}", action="use the model's own manifest")
-        terms = basis(values[None], np.array(self.mean), np.array(self.scale))[0]
-        shape, right, known = (_logistic(float(terms @ np.array(self.heads[head]))) for head in HEADS)
+        terms = quadratic(standardised(values[None], np.array(self.mean), np.array(self.scale)))[0]
+        weights = [np.array(self.heads[head]) for head in HEADS]
+        shape, right, known = (_logistic(float(terms[: len(weight)] @ weight)) for weight in weights)
         return Trust(known * shape, known * right, known)
 
     def is_unknown(self, trust: Trust) -> bool:
@@ -179,11 +189,12 @@ class ConfidenceModel:
         count = len(model.names)
         weights = [value for head in model.heads.values() for value in head]
         numbers = [*model.mean, *model.scale, *weights, model.unknown_below, model.shape_limit_m]
+        linear = 1 + count
+        lengths = {"shape": linear, "class": linear, "known": linear + count * linear // 2}
         rules = (
             (set(content) == set(cls.__slots__), f"keys {sorted(content)}"),
             (count > 0 and len(model.mean) == len(model.scale) == count, f"{count} measures"),
-            (set(model.heads) == set(HEADS), f"heads {sorted(model.heads)}"),
-            (all(len(head) == 1 + 2 * count for head in model.heads.values()), "number of weights"),
+            ({head: len(each) for head, each in model.heads.items()} == lengths, f"number of weights, not {lengths}"),
             (all(map(math.isfinite, numbers)), "a number that is not finite"),
             (all(value > 0 for value in (*model.scale, model.shape_limit_m)), "a scale that is not positive"),
             (0 <= model.unknown_below <= 1, f"unknown_below {model.unknown_below}"),
@@ -194,10 +205,16 @@ class ConfidenceModel:
         return model
 
 
-def basis(values: Float64, mean: Float64, scale: Float64) -> Float64:
-    """Terms of the logistic models [n, 1 + 2 k] from measures [n, k]: one, z, z squared."""
-    z = np.clip((values - mean) / scale, -_CUT, _CUT)
-    return np.concatenate([np.ones((len(z), 1)), z, z * z], axis=1)
+def standardised(values: Float64, mean: Float64, scale: Float64) -> Float64:
+    """Measures [n, k] in standard deviations, cut at 4."""
+    z: Float64 = np.clip((values - mean) / scale, -_CUT, _CUT)
+    return z
+
+
+def quadratic(z: Float64) -> Float64:
+    """Terms [n, 1 + k + k (k + 1) / 2] of measures [n, k]: one, z_i, and z_i z_j with i <= j, row by row."""
+    first, second = np.triu_indices(z.shape[1])
+    return np.concatenate([np.ones((len(z), 1)), z, z[:, first] * z[:, second]], axis=1)
 
 
 def _logistic(value: float) -> float:
