@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, NamedTuple, Protocol, TypeVar
@@ -190,6 +191,7 @@ def _for_workers() -> Iterator[None]:
     """What a process started now inherits: one thread for every library, and Ctrl-C blocked."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
+    resource_tracker.ensure_running()  # its own start would unblock the signal
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -204,6 +206,7 @@ def _for_workers() -> Iterator[None]:
 
 def _serve(pipe: Connection, function: Callable[[T], R]) -> None:
     """Answer items until the other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with suppress(EOFError, OSError):
         pipe.send(_GREETING)
         while True:
