@@ -8,7 +8,6 @@ its start. Distances are float64; from their fractional wavelengths on, everythi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,20 +16,12 @@ from numpy.typing import NDArray
 from edge.config import require
 from edge.dsp.buffers import zeros
 from edge.errors import RfconstructError
-from edge.frames import Complex64, Float32, Float64, Int16, Layout, RadarFrame
+from edge.frames import Complex64, Float64, Int16, Layout, RadarFrame
 from edge.reference.point_targets import element_positions_m
 from edge.waveform import SPEED_OF_LIGHT_M_S
-from train.simulate.kernels_synthesis import (
-    BLOCK,
-    CELLS,
-    LANES,
-    LEG_PLANES,
-    RX,
-    filter_amplitudes,
-    receive_legs,
-    spreader,
-    transmit_legs,
-)
+from train.simulate.burst import RESIDUE_RAD, Motion, Work, follow_motion
+from train.simulate.kernels_legs import BLOCK, CELLS, RX, chip_legs, receive_legs, station_paths, transmit_legs
+from train.simulate.kernels_synthesis import filter_amplitudes, spreader
 from train.simulate.kernels_transform import PARTS, row_of_block, transformer, twiddles
 from train.simulate.scatterers import GroundPlane, Scatterers
 
@@ -46,66 +37,10 @@ FEWEST_SAMPLES = 64
 MARGIN = 16
 """Grid rows before the cell of range 0."""
 FIRST_ROOM = 1024
-BOW_M = 4e-6
-"""Path by which a burst may bow out of one tangent; all receivers share it but for a few percent."""
-APART = 80
-"""Floats between the planes of the legs, so that they do not compete for the same lines of the cache."""
 
 
 class RangeError(RfconstructError):
     """A scatterer whose beat frequency the receiver does not pass: it would appear at a false range."""
-
-
-@dataclass(slots=True)
-class _Work:
-    """Buffers of one synthesis, for ``room`` scatterers at most; axes as the kernels name them."""
-
-    room: int
-    points: Float64
-    velocity: Float64
-    bend: Float64
-    amplitude: Float32
-    re: Float32
-    im: Float32
-    cell_out: Float32
-    base_out: NDArray[np.int32]
-    reach_out: Float64
-    legs: Float32
-    turn: Float32
-    cell_back: Float32
-    base_back: NDArray[np.int32]
-    reach_back: Float64
-    base: NDArray[np.int32]
-    drift: Float32
-    plan: Float32
-    start: NDArray[np.int32]
-
-    @classmethod
-    def make(cls, room: int, slots: int, chips: int) -> _Work:
-        """Zeroed buffers."""
-        f4, f8 = np.float32, np.float64
-        span = room * LANES + APART
-        return cls(
-            room=room,
-            points=np.zeros((2, 3, room), f8),
-            velocity=np.zeros((2, 3, room), f8),
-            bend=np.zeros(room, f8),
-            amplitude=np.zeros((2, room), f4),
-            re=np.zeros((slots, room), f4),
-            im=np.zeros((slots, room), f4),
-            cell_out=np.zeros((slots, room), f4),
-            base_out=np.zeros(room, np.int32),
-            reach_out=np.zeros((2, room), f8),
-            legs=zeros((chips, LEG_PLANES * span), f4),
-            turn=zeros((chips, 2 * span), f4),
-            cell_back=np.zeros((2, chips, room), f4),
-            base_back=np.zeros(room, np.int32),
-            reach_back=np.zeros((2, room), f8),
-            base=np.zeros(room, np.int32),
-            drift=np.zeros(room, f4),
-            plan=np.zeros((4, room), f4),
-            start=np.zeros(room, np.int32),
-        )
 
 
 class Synthesizer:
@@ -146,7 +81,10 @@ class Synthesizer:
         require(apart <= GROUP_CELLS, "distance of one chip's receivers in cells", apart, f"<= {GROUP_CELLS}")
         chips, shape = len(self._receivers_m), SHAPES[width]
         plane = (cells + MARGIN) * RX
-        self._spread = {moving: spreader(width, shape, plane, moving) for moving in (False, True)}
+        self._spread = spreader(width, shape, plane)
+        self._middles_m = np.ascontiguousarray(self._receivers_m.mean(axis=1))
+        self._apart_m = float(spread_m)
+        self._residue_m = RESIDUE_RAD[width] / (2.0 * np.pi * self._turns_per_m)
         self._transform = transformer(cells, layout.samples, MARGIN)
         self._twiddles, self._row_of = twiddles(cells), row_of_block(cells)
         self._factors = _lane_factors(shape, width)
@@ -159,10 +97,10 @@ class Synthesizer:
         self._level = np.complex64(10.0 ** (-radar.mounting.power_offset_db / 20.0))
         self._unfiltered = self._response = np.full(cells + 1, self._level)
         self._filtered_by: FrontEnd | None = None
-        self._moving, self._tangents, self._slot_s = False, 1, profile.chirp_time_s
-        self._path, self._scratch = zeros((2 * RX + 2, BLOCK), np.float64), zeros((4, RX, BLOCK))
-        self._cosines = zeros((RX, BLOCK))
-        self._work = _Work.make(FIRST_ROOM, layout.slots, chips)
+        self._motion, self._slot_s = Motion(), profile.chirp_time_s
+        self._path, self._scratch = zeros((2 * RX + 2, BLOCK), np.float64), zeros((5, RX * BLOCK))
+        self._apart, self._part, self._wave = zeros((2, RX * BLOCK), np.float64), zeros(BLOCK), zeros(2 * BLOCK)
+        self._work = Work.make(FIRST_ROOM, layout.slots, chips)
         self._beat: Complex64 | None = None
 
     def beat(self, scatterers: Scatterers, ground: GroundPlane | None = None) -> Complex64:
@@ -221,7 +159,7 @@ class Synthesizer:
             self._filtered_by, self._response = front_end, self._level * front_end.if_response(self._cells)
         self._place(scatterers, ground, self._response)
         for loop in range(layout.loops):
-            if loop == 0 or self._moving or front_end.per_chirp:
+            if loop == 0 or self._motion.run or front_end.per_chirp:
                 self._grid_loop(len(scatterers), loop, front_end.jitter_s(number, loop))
                 self._through(front_end, front_end.frequency_noise_hz(number, loop))
             front_end.digitise(self._signal, number, loop, codes)
@@ -253,7 +191,7 @@ class Synthesizer:
         """Take over the scatterers: mirrored legs, curvature of moving paths, receiver's response."""
         k = len(scatterers)
         if k > self._work.room:
-            self._work = _Work.make(1 << (k - 1).bit_length(), self._layout.slots, len(self._receivers_m))
+            self._work = Work.make(1 << (k - 1).bit_length(), self._layout.slots, len(self._receivers_m))
         work = self._work
         for leg, image in enumerate((scatterers.tx_image, scatterers.rx_image)):
             work.points[leg, :, :k] = scatterers.position_m.T
@@ -270,50 +208,63 @@ class Synthesizer:
             work.amplitude,
         )
         work.bend[:k] = 0.0
-        self._path[:] = 0.0
-        self._moving, self._tangents = bool(scatterers.velocity_m_s.any()), 1
-        if self._moving:
-            away_m = work.points[1, :, :k] - self._centre_m[:, None]
-            range_m = np.maximum(np.linalg.norm(away_m, axis=0), 1e-3)
-            velocity = work.velocity[1, :, :k]
-            radial = (velocity * away_m).sum(axis=0) / range_m
-            speed2 = np.square(velocity).sum(axis=0)
-            work.bend[:k] = 0.5 * (speed2 - np.square(radial)) / range_m
-            half_s = 0.5 * self._layout.loops * self._layout.slots * self._slot_s
-            if float((speed2 / range_m).max()) * half_s**2 > BOW_M:
-                self._tangents = self._layout.loops
+        self._motion = Motion()
+        if scatterers.velocity_m_s.any():
+            burst = (self._layout.loops, self._layout.slots, self._slot_s)
+            self._motion = follow_motion(work, k, self._centre_m, *burst, self._apart_m, self._residue_m)
+
+    def _follow(self, k: int, loop: int) -> None:
+        """Paths and receivers' phases from this loop on, for as many loops as the motion allows."""
+        work, motion, slots, slot_s = self._work, self._motion, self._layout.slots, self._slot_s
+        begin_s, late_s = loop * slots * slot_s, np.arange(slots) * slot_s
+        whole_s = (motion.span * slots - 1) * slot_s if motion.run else 0.0
+        still, scale = np.zeros(len(self._middles_m)), np.array([self._cells_per_m, self._turns_per_m, 0.0])
+        station_paths(
+            *(k, work.points[0], work.velocity[0], work.bend, self._transmitters_m),
+            *(np.append(begin_s + late_s, (motion.span - 1) * slots * slot_s), np.square(late_s - 0.5 * late_s[-1])),
+            *(scale, work.out, work.base_out, *work.reach_out, self._path),
+        )
+        scale[2] = self._offset_m
+        station_paths(
+            *(k, work.points[1], work.velocity[1], work.bend, self._middles_m, np.append(still + begin_s, whole_s)),
+            *(still, scale, work.back, work.base_back, *work.reach_chip, self._path),
+        )
+        middle_s, run_s = begin_s + 0.5 * whole_s, motion.run * slot_s
+        turns = motion.run and (motion.span > 1 or motion.run < slots)
+        timing = np.array([middle_s, begin_s + 0.5 * (run_s - slot_s) if turns else middle_s, run_s if turns else 0.0])
+        receive_legs(
+            *(k, work.points[1], work.velocity[1], self._receivers_m, self._middles_m),
+            *(scale, timing, np.float32(SHAPES[self.width])),
+            *(np.float32(self.width - 2), self._factors, work.legs, work.turn, *work.reach_back, self._path),
+            *(self._apart, self._scratch),
+        )
+        self._require_reach(k)
 
     def _grid_loop(self, k: int, loop: int, jitter_s: Float64 | None) -> None:
-        """Spread the scatterers as one loop sees them; loops come in order.
-
-        The receive legs are tangents of every loop, or of the whole burst when no path bows far from its own.
-        """
-        work, layout = self._work, self._layout
-        slots, first = layout.slots, loop if self._tangents > 1 else 0
-        time_s = (loop * slots + np.arange(slots)) * self._slot_s
-        middle_s = (first * slots + 0.5 * (slots * (1 if self._tangents > 1 else layout.loops) - 1)) * self._slot_s
-        out_scale = np.zeros(2 + slots)
-        out_scale[:2] = self._cells_per_m, self._turns_per_m
+        """Spread the scatterers as one loop sees them; loops come in order."""
+        work, motion, slots = self._work, self._motion, self._layout.slots
+        if loop == 0 or (motion.run and loop % motion.span == 0):
+            self._follow(k, loop)
+        within = loop % motion.span if motion.run else 0
+        scale = np.zeros(1 + slots, np.float32)
+        scale[0] = self._cells_per_m / self._turns_per_m
         if jitter_s is not None:
-            out_scale[2:] = jitter_s * self._jitter_turns_per_m_s
+            scale[1:] = jitter_s * self._jitter_turns_per_m_s / self._cells_per_m
+        x, chirps = within / max(motion.span - 1, 1), max(motion.span * slots - 1, 1)
         transmit_legs(
-            *(k, work.points[0], work.velocity[0], work.bend, work.amplitude, self._transmitters_m, time_s, middle_s),
-            *(out_scale, work.re, work.im, work.cell_out, work.base_out, *work.reach_out, self._path[:1]),
+            *(k, work.out, work.base_out, np.float32(x), work.amplitude, scale, work.re, work.im, work.cell_out),
+            *(self._part, self._wave),
         )
-        if loop == first:
-            timing = np.array([middle_s, time_s[0], self._slot_s if self._moving else 0.0])
-            receive_legs(
-                *(k, work.points[1], work.velocity[1], self._receivers_m),
-                *(np.array([self._cells_per_m, self._turns_per_m, self._offset_m]), timing),
-                *(np.float32(SHAPES[self.width]), np.float32(self.width - 2), self._factors, work.legs, work.turn),
-                *(work.cell_back, work.base_back, *work.reach_back, self._path, self._cosines, self._scratch),
-            )
-        self._require_reach(k)
-        self._grid[:] = 0.0
+        x, step = (within * slots + 0.5 * (slots - 1)) / chirps, 1.0 / chirps if motion.run else 0.0
+        chip_legs(
+            *(k, work.back, np.float32(x), np.float32(step), slots, scale[0], work.swing, work.swing_step),
+            *(work.cell_back, self._part, self._wave),
+        )
         work.base[:k] = work.base_out[:k] + work.base_back[:k] + MARGIN
-        self._spread[self._moving](
-            *(k, work.re, work.im, work.cell_out, work.cell_back, time_s - middle_s, work.base, work.legs, work.turn),
-            *(work.drift, work.plan, work.start, self._grid),
+        onward = within + 1 < motion.span
+        self._spread(
+            *(k, work.re, work.im, work.cell_out, work.cell_back, work.base, work.swing, work.swing_step, work.legs),
+            *(work.turn, motion.run, onward, work.plan, work.start, self._grid),
         )
 
     def _to_samples(self, response: Complex64, leakage: Complex64, signal: Complex64) -> None:
