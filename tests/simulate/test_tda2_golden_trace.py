@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import tda2_host as h
+from tda2_captures import eventually, supply
 from tda2_host import ACK, Host
-from test_tda2_board import eventually, supply
 
 from edge.frames import Layout
 from train.simulate.tda2_board import Tda2Board, Tda2Settings

@@ -118,7 +118,7 @@ def montage(spec: DriveSpec, path: Path) -> SimulatedCloud:
 def _caption(made: SimulatedCloud) -> str:
     figures, scene = made.statistics, made.settings.scene
     return (
-        f"{scene.side_m:.1f} m aside, {scene.neighbours} neighbour{'s' * (scene.neighbours != 1)}; {made.frames} frames over {made.travel_m:.1f} m; "
+        f"{scene.side_m:.1f} m aside, neighbours: {scene.neighbours}; {made.frames} frames over {made.travel_m:.1f} m; "
         f"{100 * figures.within_10cm:.0f} % of the points within 10 cm of the true surface (grey), "
         f"{100 * figures.within_20cm:.0f} % within 20 cm; the cluster is {made.status}"
     )
