@@ -14,7 +14,7 @@ from edge.bench.measure import Timing
 from edge.reference.point_targets import unpack
 from edge.rig import load_rig
 from train.cli import main
-from train.simulate import bench, bench_command
+from train.simulate import bench, bench_command, bench_drive
 from train.simulate.bench_peer import direct_delays, direct_frame
 from train.simulate.bench_report import document, lines, misses
 from train.simulate.oracle import direct_sum
@@ -33,6 +33,12 @@ def result(**changes: Any) -> dict[str, Any]:
         "memory": {"frames": 3, "before_mb": 100.0, "after_mb": 101.0},
     }
     return {**whole, **changes}
+
+
+def drive_result(after_mb: float = 301.0) -> dict[str, Any]:
+    rows = [{"stage": "optics", "calls": 600, "call_ms": 0.5, "total_ms": 300.0}]
+    memory = {"drives": 6, "before_mb": 300.0, "after_mb": after_mb}
+    return {"frames": 300, "scatterers": 611.0, "stages": rows, "third": rows, "memory": memory}
 
 
 def test_the_restated_method_is_the_definition() -> None:
@@ -59,10 +65,11 @@ def test_goals_met_and_missed() -> None:
 
 
 def test_errors_are_measured_for_every_width_and_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "SCATTERERS", 30)
+    monkeypatch.setattr(bench, "SCATTERERS", 32)
     rows = bench.errors(RIG)
     assert [(row["scene"], row["width"]) for row in rows][:2] == [("still", 4), ("still", 6)]
     assert all(row["rms_db"] < row["goal_db"] for row in rows)
+    assert [row["scene"] for row in rows if row["width"] == 4][-1] == "4 at 3 m/s, 8 loops"
 
 
 def test_command_writes_the_tables(
@@ -70,16 +77,44 @@ def test_command_writes_the_tables(
 ) -> None:
     calls: list[float] = []
 
-    def run_suite(rig: Any, seconds: float) -> dict[str, Any]:
+    def run_suite(rig: Any, seconds: float, builders: Any) -> dict[str, Any]:
         calls.append(seconds)
+        assert builders == (bench_drive.drive_cases,)
         return result()
 
     monkeypatch.setattr(bench, "run_suite", run_suite)
+    monkeypatch.setattr(bench_drive, "drive_report", lambda rig: drive_result())
     file = tmp_path / "bench.md"
     assert main(["bench", "--seconds", "3", "--markdown", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["cases"][0]["goal_ms"] == 1.5
     assert calls == [3.0]
     assert "## Error against the direct sum in float64" in file.read_text()
+    assert "| optics" in file.read_text()
+
+
+def test_drive_bys_that_leak_are_told() -> None:
+    assert list(misses(result(drive=drive_result()))) == []
+    assert list(misses(result(drive=drive_result(400.0)))) == ["Memory grows from 300 to 400 MB."]
+
+
+def test_a_drive_by_is_taken_apart_into_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six frames: each stage as often as it must be, the parts make the whole, the same drive-by is not repeated."""
+    monkeypatch.setattr(bench_drive, "FRAMES", 6)
+    monkeypatch.setattr(bench_drive, "WARM_DRIVES", 1)
+    monkeypatch.setattr(bench_drive, "MEMORY_DRIVES", 1)
+    found = bench_drive.drive_report(RIG)
+    for key, frames in (("stages", 6), ("third", 2)):
+        rows = {row["stage"]: row for row in found[key]}
+        assert rows["scene"]["calls"] == 1
+        assert rows["optics"]["calls"] == rows["synthesis"]["calls"] == rows["heatmap"]["calls"] == 2 * frames
+        parts_ms = sum(row["total_ms"] for stage, row in rows.items() if stage != "together")
+        assert parts_ms == pytest.approx(rows["together"]["total_ms"])
+    assert 300 < found["scatterers"] < 900
+    json.dumps(found, allow_nan=False)
+    cases = bench_drive.drive_cases(RIG)
+    assert [case.goal_ms for case in cases] == [4000.0, None, None, None, 6.0]
+    cases[3].call()
+    cases[3].call()
 
 
 @pytest.mark.parametrize("arguments", [["--rig", "awr1843_pair"], ["--seconds", "0"]])

@@ -32,6 +32,7 @@ def run(options: argparse.Namespace) -> int:
     from edge.frames import RADARS
     from edge.rig import load_rig
     from train.simulate.bench import run_suite
+    from train.simulate.bench_drive import drive_cases, drive_report
     from train.simulate.bench_report import document, lines
 
     if not options.seconds > 0:
@@ -40,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     kinds = {rig.radars[radar].schedule.layout.kind for radar in RADARS if radar in rig.radars}
     if len(rig.radars) != len(RADARS) or kinds != {"cascade"}:
         raise ConfigError(f"rig {rig.name} cannot be benched", allowed="two cascades", action="--rig cascade_pair")
-    result = run_suite(rig, options.seconds)
+    result = run_suite(rig, options.seconds, (drive_cases,)) | {"drive": drive_report(rig)}
     print(json.dumps(result, indent=2) if options.json else "\n".join(lines(result)))
     if options.markdown is not None:
         command = f"rfconstruct-train bench --rig {rig.name} --seconds {options.seconds:g}"

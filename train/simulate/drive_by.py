@@ -20,6 +20,7 @@ from edge.timing import StageTimes
 from train.simulate.front_end import FrontEnd
 from train.simulate.odometry_error import reported_poses
 from train.simulate.optics import SceneOptics
+from train.simulate.scatterers import GroundPlane, Scatterers
 from train.simulate.settings import SimulationSettings
 from train.simulate.settings import TrackSettings as TrackSettings
 from train.simulate.surface import Placed
@@ -128,19 +129,28 @@ class DriveBy:
         Raises:
             CaptureError: no such radar or frame.
         """
+        scatterers, ground = self.scatterers(radar, number)
+        t_ns = self.t_first_chirp_ns(radar, number)
+        with self.times.measure("synthesis"):
+            return self._synthesizers[radar].frame(scatterers, self._front_ends[radar], number, t_ns, ground)
+
+    def scatterers(self, radar: RadarId, number: int) -> tuple[Scatterers, GroundPlane]:
+        """What a frame is made of.
+
+        Raises:
+            CaptureError: no such radar or frame.
+        """
         if radar not in self.rig.radars or not 0 <= number < self.frames:
             raise CaptureError(
                 "this drive-by has no such frame", value=f"{radar} {number}", allowed=f"0..{self.frames - 1}"
             )
-        t_ns = self.t_first_chirp_ns(radar, number)
-        synthesizer, mounting = self._synthesizers[radar], self.rig.radars[radar].mounting
+        t_ns, mounting = self.t_first_chirp_ns(radar, number), self.rig.radars[radar].mounting
+        reach_m = self._synthesizers[radar].reach_m + min(mounting.range_offset_m, 0.0)
         with self.times.measure("optics"):
-            scatterers, ground = self._optics.scatterers(
+            return self._optics.scatterers(
                 *(radar, self.seconds(t_ns), self._position_m(t_ns), self._rotation, self._velocity_m_s),
-                *(synthesizer.reach_m + min(mounting.range_offset_m, 0.0), np.asarray(mounting.position_m)),
+                *(reach_m, np.asarray(mounting.position_m)),
             )
-        with self.times.measure("synthesis"):
-            return synthesizer.frame(scatterers, self._front_ends[radar], number, t_ns, ground)
 
     def true_pose(self, t_ns: int) -> Pose:
         """Where the rig is."""
