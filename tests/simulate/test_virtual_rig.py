@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 import tda2_host as h
 import zmq
+from demo_terminal import Terminal, eventually
 from tda2_host import ACK, SAFETY_S, Host
-from test_demo_cli import Terminal, eventually
 
 from edge.cli_text import cli_lines
 from edge.errors import ConfigError
