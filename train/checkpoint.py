@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class Checkpoint:
         elapsed_s: training time spent, validation and checkpoints not counted.
         settings: the run's settings as plain values.
         history: validation results so far.
+        anchor: time (or steps) and progress at which the present budget took over; see ``fit_settings.progress``.
     """
 
     model: dict[str, torch.Tensor]
@@ -40,6 +41,7 @@ class Checkpoint:
     elapsed_s: float
     settings: dict[str, Any]
     history: list[dict[str, float]]
+    anchor: list[float] = field(default_factory=lambda: [0.0, 0.0])
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

@@ -4,17 +4,17 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import platform
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edge.errors import ExitCode, ModelError, RfconstructError
+from train.evaluate_command import add_verb as add_evaluate_verb
+from train.fit_command import add_verb as add_fit_verb
 from train.objects.commands import add_verbs as object_verbs
 from train.simulate.bench_command import add_verb as add_bench_verb
 from train.simulate.command import add_verb
@@ -25,15 +25,7 @@ if TYPE_CHECKING:
     from train.checkpoint import Checkpoint
     from train.evaluate import Scores
 
-_ALLOCATOR = {
-    "MALLOC_MMAP_MAX_": "0",
-    "MALLOC_TRIM_THRESHOLD_": "20000000000",
-    "MALLOC_TOP_PAD_": "1000000000",
-    "OMP_WAIT_POLICY": "PASSIVE",
-}
-"""glibc otherwise returns large tensors to the kernel at every step (1.4 times slower); OpenMP otherwise spins."""
 _SAMPLES, _EMD_SAMPLES, _BANK = 192, 96, 800
-_TRAIN_TRUTH, _TRAIN_POINTS = 4096, 1024
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,69 +42,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="rfconstruct-train", description=__doc__)
     verbs = parser.add_subparsers(required=True, metavar="verb")
-    fit = verbs.add_parser("fit", help="train a network, or go on with a run")
-    fit.add_argument("run_folder", type=Path, help="checkpoint.pt and log.jsonl go here")
-    fit.add_argument("--resume", action="store_true", help="continue the run in the folder exactly where it stopped")
-    fit.add_argument("--width", choices=("edge", "paper", "tiny"), default="edge")
-    fit.add_argument("--minutes", type=float, default=60.0, help="training time; a run of any length ends annealed")
-    fit.add_argument("--steps", type=int, default=0, help="optimizer steps instead of minutes")
-    fit.add_argument("--batch", type=int, default=16)
-    fit.add_argument("--seed", type=int, default=0)
-    fit.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
-    fit.add_argument("--threads", type=int, default=2)
-    fit.add_argument("--workers", type=int, default=1, help="processes that prepare samples")
-    fit.add_argument("--squared", action="store_true", help="the squared distances of the paper's equations")
-    fit.add_argument("--tensorboard", action="store_true", help="also write event files for TensorBoard")
-    fit.add_argument("--simulated", type=Path, help="folder or file of simulated clouds to mix in")
-    fit.add_argument("--simulated-share", type=float, default=0.5, help="of the training samples")
-    fit.set_defaults(run=_fit)
+    add_fit_verb(verbs)
     add_verb(verbs)
     add_rig_verb(verbs)
     add_bench_verb(verbs)
     add_look_verbs(verbs)
-    for name, run, text in (
-        ("evaluate", _evaluate, "measure a model folder on held-out objects"),
-        ("export", _export, "write a model folder from a checkpoint, measured, with card and manifest"),
-    ):
-        verb = verbs.add_parser(name, help=text)
-        verb.add_argument("source", type=Path, help="model folder" if name == "evaluate" else "checkpoint.pt")
-        verb.add_argument("--samples", type=int, default=_SAMPLES, help="held-out samples")
-        verb.add_argument("--emd-samples", type=int, default=_EMD_SAMPLES, help="of these, with EMD")
-        verb.add_argument("--bank", type=int, default=_BANK, help="training shapes of the baselines, 0 = no baselines")
-        verb.add_argument("--threads", type=int, default=1)
-        verb.set_defaults(run=run)
-        if name == "evaluate":
-            verb.add_argument("--split", choices=("val", "test"), default="test")
-            verb.add_argument("--json", type=Path, help="write all figures here")
-        else:
-            verb.add_argument("target", type=Path, help="model folder, for example models/default")
-            verb.add_argument("--name", default="", help="of the model; the folder's name by default")
-            verb.add_argument("--rig", action="append", help="rig the model fits; may be repeated (cascade_pair)")
+    add_evaluate_verb(verbs)
+    verb = verbs.add_parser("export", help="write a model folder from a checkpoint, measured, with card and manifest")
+    verb.add_argument("source", type=Path, help="checkpoint.pt")
+    verb.add_argument("target", type=Path, help="model folder, for example models/default")
+    verb.add_argument("--name", default="", help="of the model; the folder's name by default")
+    verb.add_argument("--rig", action="append", help="rig the model fits; may be repeated (cascade_pair)")
+    verb.add_argument("--samples", type=int, default=_SAMPLES, help="held-out samples")
+    verb.add_argument("--emd-samples", type=int, default=_EMD_SAMPLES, help="of these, with EMD")
+    verb.add_argument("--bank", type=int, default=_BANK, help="training shapes of the baselines, 0 = no baselines")
+    verb.add_argument("--threads", type=int, default=1)
+    verb.set_defaults(run=_export)
     object_verbs(verbs)
     return parser
-
-
-def _fit(options: argparse.Namespace) -> int:
-    if options.own_process and any(os.environ.get(name) != value for name, value in _ALLOCATOR.items()):
-        os.environ.update(_ALLOCATOR)  # read by the C library at start only, hence the new start
-        os.execv(sys.executable, [sys.executable, "-m", "train.cli", *sys.argv[1:]])
-    from train.dataset import CompletionDataset, DatasetSettings
-    from train.fit import FitSettings, Trainer
-    from train.losses import LossSettings
-
-    names = {"width", "steps", "batch", "seed", "device", "threads", "workers", "tensorboard"}
-    values = {field.name: getattr(options, field.name) for field in fields(FitSettings) if field.name in names}
-    settings = FitSettings(budget_s=60 * options.minutes, loss=LossSettings(squared=options.squared), **values)
-    data = DatasetSettings.default(truth_points=_TRAIN_TRUTH, max_points=_TRAIN_POINTS)
-    train = CompletionDataset("train", data, options.seed)
-    if options.simulated:
-        from train.simulated import SimulatedDataset
-
-        train = SimulatedDataset(options.simulated, "train", data, options.seed, options.simulated_share)
-        print(train.summary, flush=True)
-    validation = CompletionDataset("val", DatasetSettings.default(), 0)
-    Trainer(settings, train, validation, options.run_folder, options.resume).run()
-    return int(ExitCode.OK)
 
 
 def _scores(options: argparse.Namespace, folder: Path, split: str) -> dict[str, Scores]:
@@ -125,21 +72,6 @@ def _scores(options: argparse.Namespace, folder: Path, split: str) -> dict[str, 
     dataset = CompletionDataset("val" if split == "val" else "test", DatasetSettings.default(), 0)
     models = {name: OnnxModel(folder / name) for name in (FULL, SMALL)}
     return evaluate(models, dataset, options.samples, options.emd_samples, bank, options.threads)
-
-
-def _evaluate(options: argparse.Namespace) -> int:
-    from train.evaluate import MACRO, table
-    from train.manifest import FULL, SMALL
-
-    scores = _scores(options, options.source, options.split)
-    rows = [(f"{name} {c}", name, c) for name in (FULL, SMALL) for c in [*scores[FULL].classes, MACRO]]
-    rows += [(name, name, MACRO) for name in scores if name not in (FULL, SMALL)]
-    print(table(scores, rows))
-    for name in (FULL, SMALL):
-        print(f"{name} class accuracy {scores[name].summary('class_right').mean:.3f} (macro)")
-    if options.json:
-        options.json.write_text(json.dumps({name: asdict(one) for name, one in scores.items()}) + "\n")
-    return int(ExitCode.OK)
 
 
 def _export(options: argparse.Namespace) -> int:

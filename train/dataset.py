@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -46,12 +47,16 @@ class Sample:
         truth: float32 [truth_points, 3], same frame, uniform by area, random order.
         label: index into CLASSES.
         object_id: "<class>/<name>".
+        size_m: extent of the complete object along its own axes.
+        power_db: float32 [n], relative to the cloud's median; None where the source has no powers.
     """
 
     partial: Float32
     truth: Float32
     label: int
     object_id: str
+    size_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    power_db: Float32 | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,12 @@ class DatasetSettings:
         """Settings with the project's object library when this machine has one."""
         return replace(cls(objects_dir=default_objects_dir()), **changes)  # type: ignore[arg-type]
 
+    @classmethod
+    def pcn(cls, **changes: object) -> DatasetSettings:
+        """The same objects, their partial clouds made PCN's way: clean depth scans, no errors of the frame."""
+        plain = cls.default(perturbation=PerturbSettings.clean(), sight_sigma_deg=0.0, ground_sigma_m=0.0)
+        return replace(plain, **changes)  # type: ignore[arg-type]
+
 
 class CompletionDataset(torch.utils.data.Dataset[Sample]):
     """Map-style data set; item ``index`` is a pure function of (split, seed, epoch, index, settings).
@@ -185,7 +196,7 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
             "box_frame": self.settings.box_frame,
             "sight_sigma_deg": self.settings.sight_sigma_deg,
             "ground_sigma_m": self.settings.ground_sigma_m,
-        }
+        } | ({"perturbation": repr(changed)} if (changed := self.settings.perturbation) != PerturbSettings() else {})
 
     def mesh(self, index: int) -> Mesh:
         """The complete object of a sample, before yaw and shift."""
@@ -213,7 +224,9 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
         if not settings.box_frame:
             partial, truth = self._as_seen(partial, truth, bearing_rad(mesh.object_id, radar_m, partial), rng)
-        return Sample(np.ascontiguousarray(partial), np.ascontiguousarray(truth), mesh.label, mesh.object_id)
+        return Sample(
+            np.ascontiguousarray(partial), np.ascontiguousarray(truth), mesh.label, mesh.object_id, size_of(mesh)
+        )
 
     def _as_seen(
         self, partial: Float32, truth: Float32, bearing: float, rng: np.random.Generator
@@ -254,6 +267,12 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         return vary(mesh, self.settings.deformation, rng)
 
 
+def size_of(mesh: Mesh) -> tuple[float, float, float]:
+    """Extent along x, y and z, metres."""
+    x_m, y_m, z_m = (float(v) for v in mesh.size_m)
+    return x_m, y_m, z_m
+
+
 def _spread(points: Float32) -> float:
     """Standard deviation of points [n, 3] about their mean, all axes together, metres."""
     return float(np.sqrt(points.var(axis=0).sum()))
@@ -287,12 +306,13 @@ def _person(model: Path, number: int) -> Mesh:
     return HumanModel.load(model).person(number)
 
 
-def mean_shape(dataset: CompletionDataset, points: int) -> Float32:
+def mean_shape(dataset: CompletionDataset, points: int, see: Callable[[Sample], Sample] = lambda one: one) -> Float32:
     """A cloud drawn from the mean distribution of the data: every point from the truth of another random sample.
 
     Args:
         dataset: where the samples come from.
         points: size of the result.
+        see: puts a sample into the frame of the network.
     Returns:
         float32 [points, 3], in the samples' frame.
     """
@@ -301,6 +321,6 @@ def mean_shape(dataset: CompletionDataset, points: int) -> Float32:
     chosen = rng.choice(len(dataset), draws, replace=False)
     counts = np.full(draws, points // draws)
     counts[: points % draws] += 1
-    parts = [dataset[int(i)].truth[:n] for i, n in zip(chosen, counts, strict=True)]
+    parts = [see(dataset[int(i)]).truth[:n] for i, n in zip(chosen, counts, strict=True)]
     shape = np.concatenate(parts)
     return shape[rng.permutation(len(shape))]

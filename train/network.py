@@ -266,7 +266,7 @@ class CompletionNetwork(CompletionModel):
         Everything that does not differ per fine point is computed once.
         """
         weight, channels = self.fold1.weight, self.width.local[1]
-        bias = self.fold1.bias
+        bias: Tensor = self.fold1.bias
         with exactly(coarse):
             if self.local:
                 bias = bias + weight[:, 5 : 5 + channels] @ self.local2.bias

@@ -108,3 +108,12 @@ class PerturbSettings:
             streak_probability=0, clip=False, sparse_probability=0, thin=False,
         )  # fmt: skip
         return replace(plain, **changes)  # type: ignore[arg-type]
+
+    @classmethod
+    def clean(cls, **changes: object) -> PerturbSettings:
+        """Partial clouds as PCN makes them (Yuan et al. 2018, section 5.1): one depth scan, back-projected, no noise.
+
+        The camera stands anywhere around the object, up to 6 m high, as PCN's views are not those of a car.
+        """
+        plain = cls.paper(holes=False, noise=False, height_m=(0.3, 6.0), aim_deg=0.0, base_points=(2048, 2048))
+        return replace(plain, **changes)  # type: ignore[arg-type]

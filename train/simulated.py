@@ -11,7 +11,7 @@ import numpy as np
 from edge.completion.sight import bearing_rad
 from edge.config import require
 from edge.errors import RecordingError
-from train.dataset import CompletionDataset, DatasetSettings, Sample
+from train.dataset import CompletionDataset, DatasetSettings, Sample, size_of
 from train.objects.library import SPLITS, Split
 from train.objects.mesh import CLASSES, Mesh, MeshError
 from train.objects.reference import HUMAN_FILE, ObjectRef
@@ -99,7 +99,8 @@ class SimulatedDataset(CompletionDataset):
         count = most = min(len(cloud), settings.max_points)
         if self.split == "train" and rng.random() < THIN_SHARE:
             count = round(np.exp(rng.uniform(np.log(min(settings.min_points, most)), np.log(most))))
-        partial = cloud.xyz_m[rng.permutation(len(cloud))[:count]]
+        chosen = rng.permutation(len(cloud))[:count]
+        partial, power_db = cloud.xyz_m[chosen], cloud.power_db[chosen] - np.median(cloud.power_db)
         truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
         rotation, translation = cloud.rotation.astype(np.float32), cloud.translation_m.astype(np.float32)
         if settings.box_frame:
@@ -110,7 +111,8 @@ class SimulatedDataset(CompletionDataset):
         if self.split == "train" and rng.random() < MIRROR_SHARE:
             mirror = np.array([1, -1, 1], np.float32)
             partial, truth = partial * mirror, truth * mirror
-        return Sample(np.ascontiguousarray(partial), np.ascontiguousarray(truth), mesh.label, cloud.object)
+        partial, truth = np.ascontiguousarray(partial), np.ascontiguousarray(truth)
+        return Sample(partial, truth, mesh.label, cloud.object, size_of(mesh), power_db.astype(np.float32))
 
     def _checked_mesh(self, name: str) -> Mesh:
         mesh = _mesh(name, self.settings.objects_dir)

@@ -72,7 +72,7 @@ class _Edge(nn.Module):
         mine = own[:, :, None].expand_as(near)
         value = self.layer(torch.cat([near - mine, mine], -1))
         value = self.activation(self.norm(value.flatten(1, 2).transpose(1, 2)).transpose(1, 2))
-        result: Tensor = value.unflatten(1, tuple(index.shape[1:])).amax(2)
+        result: Tensor = value.reshape(*index.shape, value.shape[-1]).amax(2)
         return result
 
 
@@ -222,7 +222,7 @@ class AdaPoinTr(CompletionModel):
         """The best of predicted and input points: positions [b, q, 3], network units, and their scores [b, q, 1]."""
         with exactly(feature):
             predicted = self.coarse(feature.float() if feature.dtype == torch.bfloat16 else feature)
-            predicted = predicted.unflatten(-1, (-1, 3))
+            predicted = predicted.view(len(feature), self.coarse_points, 3)
             candidates = torch.cat([predicted, take(cloud, farthest(cloud, self.coarse_points // 2))], 1)
             score = torch.sigmoid(self.score(candidates))
         best = score[..., 0].topk(self.coarse_points, dim=1).indices
@@ -245,4 +245,4 @@ class AdaPoinTr(CompletionModel):
         reduced = self.reduce(wide)
         top = reduced[:, : self.coarse_points].amax(1, keepdim=True).expand_as(reduced)
         patches: Tensor = self.rebuild(torch.cat([top, reduced], -1))
-        return patches.unflatten(-1, (-1, 3))
+        return patches.view(*asked.shape[:2], self.cells, 3)

@@ -60,4 +60,4 @@ def neighbours(queries: Tensor, points: Tensor, count: int, allowed: Tensor | No
 def take(values: Tensor, index: Tensor) -> Tensor:
     """Rows of every batch element: [b, n, c], int64 [b, ...] -> [b, ..., c]."""
     flat = index.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
-    return values.gather(1, flat).unflatten(1, tuple(index.shape[1:]))
+    return values.gather(1, flat).view(*index.shape, values.shape[-1])
