@@ -26,7 +26,13 @@ class TwoCores:
         self._thread.start()
 
     def both(self, here: Callable[[], object], there: Callable[[], object]) -> tuple[object, object]:
-        """Results of both calls."""
+        """Results of both calls.
+
+        Raises:
+            RuntimeError: closed before.
+        """
+        if not self._thread.is_alive():
+            raise RuntimeError("the second core's thread has been closed")
         self._work.put(there)
         try:
             mine = here()

@@ -87,6 +87,8 @@ def test_two_cores_give_the_same_points_and_pass_errors_on() -> None:
         with pytest.raises(KeyError):
             cores.both(lambda: {}["x"], lambda: None)
         assert cores.both(lambda: 1, lambda: 2) == (1, 2)
+    with pytest.raises(RuntimeError, match="closed"):
+        cores.both(lambda: 1, lambda: 2)
 
 
 def test_every_call_gets_the_same_time_and_slow_ones_three_turns() -> None:

@@ -10,11 +10,10 @@ from edge.config import HeatmapSettings
 from edge.dsp import tables
 from edge.dsp.buffers import zeros
 from edge.dsp.kernels_doppler import doppler_fft, doppler_row, keep_larger, resolve_folds
-from edge.dsp.kernels_heatmap import angle_kernel
+from edge.dsp.kernels_heatmap import ANGLE_LANES, angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
 from edge.frames import DopplerMaps, Float32, Heatmap
 
-ANGLE_LANES = 64
 LEAST_RANGE_M = 0.1
 
 
@@ -70,7 +69,7 @@ class DopplerFft:
         self._row = zeros((2, geometry.count, points))
         self._angle_kernel = angle_kernel(bins, points, ANGLE_LANES)
         self._twiddle = tables.twiddles(bins, +1, 0)
-        self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
+        self._target = tables.centred_rows(bins)
         self._angle_work = zeros(2 * bins * ANGLE_LANES)
         maps = zeros((size, bins, points))
         index = np.zeros((size, points), dtype=np.int8)

@@ -24,7 +24,7 @@ from edge.dsp.elevation import ElevationRows
 from edge.dsp.interpolation import fit_response
 from edge.dsp.kernels_checks import all_zero, dead_channels
 from edge.dsp.kernels_doppler import PADDING, channel_kernel
-from edge.dsp.kernels_heatmap import angle_kernel, range_kernel, row_kernel, set_phasors
+from edge.dsp.kernels_heatmap import ANGLE_LANES, angle_kernel, range_kernel, row_kernel, set_phasors
 from edge.dsp.row import RowGeometry
 from edge.dsp.steering import SOLVES_A_FRAME, Steering
 from edge.errors import CaptureError
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from edge.rig import Radar
 
 SHORTEST_RANGE_M = 0.05
-ANGLE_LANES = 64
 STILL = np.zeros(1)
 LARGEST_MOTION_ERROR_RAD = 0.01
 """Motion's phase error over the row, rms at the edge of the field of view, that is left alone."""
@@ -177,7 +176,7 @@ class Imager:
         self._range_twiddle = aligned(tables.twiddles(self.points, -1, layout.rx))
         self._range_order = tables.last_stage_order(self.points)
         self._angle_twiddle = tables.twiddles(bins, +1, 0)
-        self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
+        self._target = tables.centred_rows(bins)
         self._phasor = np.ones(layout.slots, dtype=np.complex64)
         self._spectra, self._sums = zeros((len(self._blocks.pairs), 2 * plane)), zeros(2 * plane)
         self._spectra_rows = self._spectra.view(np.complex128)
@@ -387,8 +386,3 @@ class Imager:
         require(self.settings.read_elevation, "heatmap.read_elevation", False, "true for beams of the elevation rows")
         beams = self._elevation.beams(self._spectra, range_bin, direction_cosine, closing_m_s)
         return self._elevation.turns_per_cosine, beams
-
-    @property
-    def row(self) -> Float32:
-        """Calibrated, focused, tapered spectra [(re, im), element, range] of the last frame's last sector."""
-        return self._row

@@ -11,7 +11,7 @@ from numba import float32, float64, int64, njit, types
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 LARGEST_PARABOLA = 0.5
 DEFOCUS_STEP_PER_M = 0.01
-"""As in edge/dsp/tables.py."""
+"""Left-over curvature from one level of the bounds in angle to the next."""
 
 
 @njit(inline="always")

@@ -21,6 +21,8 @@ from numba import complex64, complex128, float32, float64, int32, int64, njit, t
 RAIL = 32767
 RECEIVERS = 4
 """Of one device, all there are: their float32 values are moved as one complex128."""
+ANGLE_LANES = 64
+"""Range bins that the angle FFT works on together."""
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 RAW = types.Array(int32, 1, "C", readonly=True)

@@ -20,6 +20,13 @@ PLANE, BLOCK, WHOLE = float64[:, ::1], float64[:, :, ::1], int64[:, ::1]
 
 
 @njit(inline="always")
+def _copy(source, target):  # type: ignore[no-untyped-def]
+    """Value by value: a copy of a slice would compile a second for its error message."""
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+@njit(inline="always")
 def _turns(step, out):  # type: ignore[no-untyped-def]
     """out [(cos, sin), n, points] = exp(j n step), by recurrence."""
     for p in range(len(step)):
@@ -46,8 +53,8 @@ def _right_hand_side(step, share, wanted, place, emphasis, right):  # type: igno
 
 
 @njit(inline="always")
-def _normal_matrix(along, late, share, emphasis, pair, of, sums, normal):  # type: ignore[no-untyped-def]
-    """Lower triangle of sum over points of emphasis share^2 cos(difference of two channels' phases)."""
+def _normal_matrix(along, late, share, emphasis, pair, of, ridge, sums, normal):  # type: ignore[no-untyped-def]
+    """Lower triangle of sum over points of emphasis share^2 cos(difference of two channels' phases), and the ridge."""
     points = len(share)
     for s in range(late.shape[1]):
         for p in range(points):
@@ -63,6 +70,7 @@ def _normal_matrix(along, late, share, emphasis, pair, of, sums, normal):  # typ
     for i in range(normal.shape[0]):
         for k in range(i + 1):
             normal[i, k] = sums[of[i, k]]
+        normal[i, i] += ridge
 
 
 @njit(inline="always")
@@ -86,9 +94,12 @@ def _solve(normal, x):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _respond(along, late, share, index, weight, part, error):  # type: ignore[no-untyped-def]
-    """error [point] = share |response|; ``part`` [4, points] holds the sums of one slot and of all of them."""
-    points = len(share)
+def _respond(along, late, share, beyond, index, weight, part, error):  # type: ignore[no-untyped-def]
+    """error [point] = share |response|; returns the largest beyond the main lobe.
+
+    ``part`` [4, points] holds the sums of one slot and of all of them.
+    """
+    points, largest = len(share), 0.0
     part[:] = 0.0
     for s in range(late.shape[1]):
         for p in range(points):
@@ -104,6 +115,8 @@ def _respond(along, late, share, index, weight, part, error):  # type: ignore[no
             part[3, p] += part[0, p] * late[1, s, p] + part[1, p] * late[0, s, p]
     for p in range(points):
         error[p] = share[p] * np.sqrt(part[2, p] * part[2, p] + part[3, p] * part[3, p])
+        largest = max(largest, error[p]) if beyond[p] else largest
+    return largest
 
 
 @njit(inline="always")
@@ -158,10 +171,8 @@ def level_lobes(  # type: ignore[no-untyped-def]
         index: int64 [2, n], the same, counted from 0.
         pair: int64 [2, pairs], different differences of two channels in elements (not negative) and in slots.
         of: int64 [n, n], which of them two channels have.
-        main_lobe, ridge, level: as said; the ridge is relative to the mean over points.
-        rounds: at most.
-        along, late: float64 [2, elements, points] and [4, slots, points] scratch.
-        line: float64 [6, points] scratch.
+        main_lobe, ridge, level, rounds: as said, at most so many; the ridge is relative to the mean over points.
+        along, late, line: float64 [2, elements, points], [4, slots, points] and [6, points] scratch.
         sums, normal: float64 [pairs] and [n, n] scratch.
         weight: float64 [3, n], receives the best weights, which sum to 1, and the last; scratch.
     Returns:
@@ -177,20 +188,14 @@ def level_lobes(  # type: ignore[no-untyped-def]
     _right_hand_side(step, share, point[1], place, emphasis, right)
     lowest = 1e30
     for _ in range(rounds):
-        _normal_matrix(along, late, share, emphasis, pair, of, sums, normal)
-        for i in range(len(w)):
-            normal[i, i] += ridge
-            w[i] = right[i]
+        _normal_matrix(along, late, share, emphasis, pair, of, ridge, sums, normal)
+        _copy(right, w)
         _solve(normal, w)
         w /= w.sum()
-        _respond(along, late, share, index, w, part, error)
-        largest = 0.0
-        for p in range(points):
-            largest = max(largest, error[p]) if beyond[p] else largest
+        largest = _respond(along, late, share, beyond, index, w, part, error)
         if largest < lowest:
             lowest = largest
-            for i in range(len(w)):  # a copy of a slice would compile a second for its error message
-                best[i] = w[i]
+            _copy(w, best)
         if largest <= level:
             break
         _reweigh(error, beyond, largest, emphasis)

@@ -22,7 +22,7 @@ from edge.dsp import tables, tdm
 from edge.dsp.beam_weights import BeamWeights, sector_closing_m_s
 from edge.dsp.buffers import zeros
 from edge.dsp.kernels_doppler import FINE, FRACTIONS, ROUNDS, SPREAD_SHAPE, TAPS, plan_spreading, set_turns, spread
-from edge.dsp.kernels_heatmap import angle_kernel
+from edge.dsp.kernels_heatmap import ANGLE_LANES, angle_kernel
 from edge.dsp.row import RowChannels, RowGeometry
 from edge.frames import BurstMotion, Float32, Float64
 
@@ -34,7 +34,6 @@ MARGIN = TAPS + 2
 DENSITY_REACH = 4
 DENSITY_SHARE = 0.75
 """Density counts by sinc^2(0.75 x), whose spectrum ends at 3/4 of the grid's period: the field of view."""
-ANGLE_LANES = 64
 SOLVES_A_FRAME = 1
 """Sectors whose level lobes one frame may solve for: 1 to 2.5 ms."""
 STILL_CELLS = 0.02
@@ -100,7 +99,7 @@ class Steering:
         self._rows = [zeros((2, cells, points)) for cells in (bins // 2, bins)]
         self._angle_kernels = [angle_kernel(bins, points, ANGLE_LANES, whole) for whole in (False, True)]
         self._twiddle = tables.twiddles(bins, +1, 0)
-        self._target = (tables.frequency_of_row(bins) + bins // 2) % bins
+        self._target = tables.centred_rows(bins)
         self._work = zeros(2 * bins * ANGLE_LANES)
 
     def loops_that_fit(self, forward_m_s: float, along_m_s: float, most: int) -> int:

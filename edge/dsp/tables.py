@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.config import HeatmapSettings, WindowName
+from edge.dsp.kernels_detect import DEFOCUS_STEP_PER_M
 from edge.frames import Float32, Float64
 
 Int64 = NDArray[np.int64]
 Complex128 = NDArray[np.complex128]
 ENVELOPE_STEPS = 16
 """Points a bin at which a response is searched for its sidelobes."""
-DEFOCUS_STEP_PER_M, DEFOCUS_LEVELS = 0.01, 32
+DEFOCUS_LEVELS = 32
 """Left-over curvature up to 0.31 / m: a point at 0.8 m and 45 degrees."""
 
 
@@ -168,6 +169,11 @@ def frequency_of_row(points: int) -> Int64:
     if weight < points:
         frequency += weight * (rows % 2)
     return frequency
+
+
+def centred_rows(points: int) -> Int64:
+    """Row of a map with frequency 0 in its middle that each row after the in-place stages belongs to."""
+    return (frequency_of_row(points) + points // 2) % points
 
 
 def last_stage_order(points: int) -> Int64:

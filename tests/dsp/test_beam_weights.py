@@ -178,3 +178,11 @@ class TestNewSpeeds:
         for n in range(3):
             assert imager.process(frame, np.array([5.0, 0.0, 2.0])).maps > 1
             assert imager._steering.beam_weights.solved == n + 1
+
+    def test_recalibrated_is_as_new(self, frame):
+        first, again = (Imager(cascade_radar(), HeatmapSettings(), FLAT) for _ in range(2))
+        ramp_up(first, frame, 8 * [8.0])
+        first.recalibrate(first.radar.calibration)
+        (power,), solves = ramp_up(first, frame, [8.0])
+        assert solves == [1]
+        np.testing.assert_array_equal(power, again.process(frame, np.array([8.0, 0.0, 0.0])).power)
