@@ -149,14 +149,14 @@ def logistic_fit(terms: Float64, event: np.ndarray, weight: Float64 | None = Non
 
 
 def training_cases(cases: Sequence[Case], seed: int = 0) -> list[Case]:
-    """Every case as it is and once worsened at random."""
+    """Every case as it is and twice worsened at random."""
     known = [cases[position] for position in range(len(cases))]
     rng = np.random.default_rng(seed)
-    return known + [worsened(case, rng, known) for case in known]
+    return known + [worsened(case, rng, known) for case in [*known, *known]]
 
 
 def confidence_for(
-    predictor: Predictor, cases: Sequence[Case], clutter: int = 120, seed: int = 0, threads: int = 1
+    predictor: Predictor, cases: Sequence[Case], clutter: int = 240, seed: int = 0, threads: int = 1
 ) -> ConfidenceModel:
     """The confidence model of a network: what an export needs.
 

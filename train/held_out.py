@@ -72,7 +72,7 @@ class Case:
         """The same object with another input."""
         return replace(
             self,
-            sample=replace(self.sample, partial=np.ascontiguousarray(partial, np.float32)),
+            sample=replace(self.sample, partial=np.ascontiguousarray(partial, np.float32), power_db=None),
             frames=self.frames if frames is None else frames,
             frame_number=None,
         )
@@ -113,6 +113,20 @@ class HeldOut(Sequence[Case]):
     def spread(self, count: int) -> HeldOut:
         """At most ``count`` cases, evenly over all."""
         return HeldOut(self.dataset, [self.indices[position] for position in spread(len(self), count)])
+
+
+class Joined(Sequence[Case]):
+    """Several sources one after the other."""
+
+    def __init__(self, parts: Sequence[Sequence[Case]]) -> None:
+        self._places = [(part, position) for part in parts for position in range(len(part))]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, position: int) -> Case:  # type: ignore[override]
+        part, inner = self._places[position]
+        return part[inner]
 
 
 def held_out(

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from edge.completion.model import UNKNOWN, CompletionModel
+from edge.completion.model import UNKNOWN
+from edge.completion.model import CompletionModel as EdgeModel
 from edge.config import CompletionSettings
 from edge.errors import ModelError
 from edge.frames import Float32, ObjectCloud, Pose
 from train.held_out import Case
 
 if TYPE_CHECKING:
-    from train.network import CompletionNetwork
+    from train.network import CompletionModel
 
 _SENSOR_M = 10.0
 
@@ -65,7 +66,7 @@ class EdgePredictor:
     """
 
     def __init__(self, folder: Path, file: str | None = None) -> None:
-        self.model = CompletionModel.load(folder, CompletionSettings(), file=file)
+        self.model = EdgeModel.load(folder, CompletionSettings(), file=file)
 
     @property
     def box_frame(self) -> bool:
@@ -93,25 +94,42 @@ class EdgePredictor:
 
 
 class TorchPredictor:
-    """A network in PyTorch, in evaluation mode.
+    """A network in PyTorch.
 
     Args:
-        network: takes points [n, 3] in metres and [n], gives ``coarse``, ``fine``, ``logits`` (None: no classifier).
+        network: any of ``networks.registry``.
     """
 
-    def __init__(self, network: CompletionNetwork) -> None:
+    def __init__(self, network: CompletionModel) -> None:
         self.network = network.eval()
+        self.box_frame = network.frame == "box"
+
+    @classmethod
+    def load(cls, checkpoint: Path) -> TorchPredictor:
+        """The averaged weights of a run; ModelError when it is no checkpoint."""
+        from train.checkpoint import load_checkpoint
+        from train.networks.registry import of_checkpoint
+
+        return cls(of_checkpoint(load_checkpoint(checkpoint)))
 
     def __call__(self, case: Case) -> Answer:
-        """The answer."""
+        """The answer, in the frame of the case, metres."""
         import torch
 
+        from train.batches import collate
+
+        network = self.network
+        batch = collate([case.sample], network.frame, network.columns)
         with torch.inference_mode():
-            points = torch.from_numpy(case.sample.partial)
-            answer = self.network(points, [len(points)])
-        logits = answer.logits
-        fine, coarse = answer.fine[0].float().numpy(), answer.coarse[0].float().numpy()
-        if logits is None:
-            return Answer(fine, coarse)
-        probability = logits[0].float().softmax(0).numpy()
-        return Answer(fine, coarse, probability)
+            answer = network(batch.points_m, batch.counts)
+        unit_m = case.diagonal_m if self.box_frame else 1.0
+        origin_m = np.array([0, 0, case.mesh.size_m[2] / 2 if self.box_frame else 0], np.float32)
+        fine, coarse = (points[0].float().numpy() * unit_m + origin_m for points in (answer.fine, answer.coarse))
+        known = answer.logits is not None and answer.logits.shape[1] > 0
+        sigma = answer.log_sigma
+        return Answer(
+            np.ascontiguousarray(fine, np.float32),
+            np.ascontiguousarray(coarse, np.float32),
+            answer.logits[0].float().softmax(0).numpy() if known else None,
+            sigma_m=None if sigma is None else float(sigma[0].exp().mean()) * network.scale * unit_m,
+        )

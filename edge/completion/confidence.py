@@ -59,7 +59,7 @@ def measures(
         Name -> number: ``points`` and ``frames`` (log2 against 256 points and a full window, the latter at most 0),
         ``odds`` (log-odds of the most probable class), ``p0``, ``p1`` .. (class probabilities), ``near`` (share of
         input points within 10 cm of the answer), ``seen`` (share of the answer within 30 cm of an input point),
-        ``low_m`` (5 % quantile of the input's heights), and as log2 of metres, at least 2 cm: ``away`` (mean distance
+        ``below`` (share of the input 10 cm or more below the ground), and as log2 of metres, at least 2 cm: ``away`` (mean distance
         of input points from the answer, each at most 1 m), ``long``, ``wide`` (standard deviations of the input along
         its horizontal principal axes), ``high`` (95 % quantile of its heights), ``answer_long``, ``answer_high`` (the
         same of the answer), ``sigma`` where given.
@@ -68,7 +68,6 @@ def measures(
     squared = _squared_distances(rows, surface)
     forth = np.sqrt(squared.min(axis=1))
     back = np.sqrt(squared.min(axis=0))
-    low, high = np.quantile(points_m[:, 2], (0.05, 0.95))
     long_m, wide_m = _axes(points_m)
     result = {
         "points": math.log2(len(points_m) / 256),
@@ -76,11 +75,11 @@ def measures(
         **({} if probability is None else _of_classes(np.asarray(probability, dtype=np.float64))),
         "near": float((forth < NEAR_M).mean()),
         "seen": float((back < SEEN_M).mean()),
-        "low_m": float(low),
+        "below": float((points_m[:, 2] < -NEAR_M).mean()),
         "away": _log(float(np.minimum(forth, _FAR_M).mean())),
         "long": _log(long_m),
         "wide": _log(wide_m),
-        "high": _log(float(high)),
+        "high": _log(float(np.quantile(points_m[:, 2], 0.95))),
         "answer_long": _log(_axes(surface)[0]),
         "answer_high": _log(float(np.quantile(surface[:, 2], 0.95))),
     }
