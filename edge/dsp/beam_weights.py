@@ -27,16 +27,19 @@ from edge.frames import Float64
 
 GRID_M_S = 0.5
 RIDGE = 0.04
+"""rho, over the mean of the points' squared responses."""
 HEADROOM = 0.6
 """Lobes asked for, over the resting ones': speeds are rounded."""
 ROUNDS = 8
 POINTS = 140
 """Directions of points over the field of view, for each direction of the beam; those of three beams interlace."""
 BEAMS = 5
+"""Directions of the beam over a sector."""
 MAIN_LOBE_WEIGHT = 2.0
 LOBES_FROM = 1.03
 """Nulls from the middle: the main lobe may widen by so much."""
 OUTER, BENT_SHARE = (0.8, 0.95), 0.25
+"""Directions of the beam beyond the field of view, and what their lobes count where the tangent leaves the curve."""
 DIRECTIONS = np.linspace(-tdm.FOV_COSINE, tdm.FOV_COSINE, POINTS)
 LOBE = np.array([-0.9, -0.7, -0.5, -0.3, 0.0, 0.3, 0.5, 0.7, 0.9])
 """Points within the main lobe, nulls from its middle."""
