@@ -19,8 +19,8 @@ NEAREST_M = 0.1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _loss_db(x: float, y: float, z: float, pattern: Float64) -> float:  # pragma: no cover - compiled
-    """One-way pattern loss towards a unit vector in the rig frame; see ``edge.dsp.antenna``.
+def _loss_db(y: float, z: float, pattern: Float64) -> float:  # pragma: no cover - compiled
+    """One-way pattern loss towards a unit vector's y and z in rig axes; see ``edge.dsp.antenna``.
 
     ``pattern``: array axis (1 = y, 2 = z), along edge deg, along loss, across edge deg, across loss, most dB.
     """
@@ -45,7 +45,7 @@ def _legs(
         return 0.0, np.inf
     leg = 0.0
     if path != GROUND:
-        leg = 10.0 ** (-_loss_db(x / direct, y / direct, z / direct, pattern) / 20.0) / direct
+        leg = 10.0 ** (-_loss_db(y / direct, z / direct, pattern) / 20.0) / direct
         if path == DIRECT:
             return leg * leg, direct
     height = ground[3]
@@ -56,7 +56,7 @@ def _legs(
     image = math.sqrt(mx * mx + my * my + mz * mz)
     sine = (above + height) / image
     gamma = mirror(sine, abs(ground[4]), ground[4] < 0.0, ground[5])
-    mirrored = gamma * 10.0 ** (-_loss_db(mx / image, my / image, mz / image, pattern) / 20.0) / image
+    mirrored = gamma * 10.0 ** (-_loss_db(my / image, mz / image, pattern) / 20.0) / image
     if path == MIXED:
         return leg * mirrored, 0.5 * (direct + image)
     return mirrored * mirrored, image
