@@ -59,10 +59,10 @@ def measures(
         Name -> number: ``points`` and ``frames`` (log2 against 256 points and a full window, the latter at most 0),
         ``odds`` (log-odds of the most probable class), ``p0``, ``p1`` .. (class probabilities), ``near`` (share of
         input points within 10 cm of the answer), ``seen`` (share of the answer within 30 cm of an input point),
-        ``below`` (share of the input 10 cm or more below the ground), and as log2 of metres, at least 2 cm: ``away`` (mean distance
-        of input points from the answer, each at most 1 m), ``long``, ``wide`` (standard deviations of the input along
-        its horizontal principal axes), ``high`` (95 % quantile of its heights), ``answer_long``, ``answer_high`` (the
-        same of the answer), ``sigma`` where given.
+        ``below`` (share of the input 10 cm or more below the ground), and as log2 of metres, at least 2 cm: ``away``
+        (mean distance of input points from the answer, each at most 1 m), ``long``, ``wide`` (standard deviations of
+        the input along its horizontal principal axes), ``high`` (95 % quantile of its heights), ``answer_long``,
+        ``answer_high`` (the same of the answer), ``sigma`` where given.
     """
     rows, surface = _some(points_m, _INPUT_ROWS), _some(fine_m, _SURFACE_ROWS)
     squared = _squared_distances(rows, surface)

@@ -118,7 +118,7 @@ def test_export_command_writes_a_whole_folder(
     assert "no radar" in card
     assert "80 samples" in card
     assert main(["evaluate", str(target), "--samples", "4", "--emd-samples", "0", "--bank", "0"]) == 0
-    assert "model.onnx macro" in capsys.readouterr().out
+    assert "mean Chamfer distance" in capsys.readouterr().out
 
 
 def test_commands_name_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from edge.errors import ConfigError
-from train.metrics import emd_distances, shape_metrics, summarize
+from train.metrics import emd_distances, emd_excess, shape_metrics, summarize
 
 
 def test_metrics_equal_brute_force() -> None:
@@ -77,3 +77,22 @@ def test_summary_is_the_mean_of_class_means_over_whole_objects() -> None:
     assert wide.high - wide.mean == pytest.approx(half_width, rel=0.15)
     with pytest.raises(ConfigError):
         summarize([math.nan], ["a"], [0])
+
+
+def test_two_spheres_shifted_against_each_other() -> None:
+    """A sphere shifted by d: the distance to the surface is d |cos|, on average d / 2; every match costs d."""
+    direction = np.random.default_rng(4).normal(size=(20_000, 3))
+    sphere = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    result = shape_metrics(sphere[:2048] + np.float32([0.2, 0, 0]), sphere[:2048])
+    assert result["emd_cm"] == pytest.approx(20, rel=0.011)
+    result = shape_metrics(sphere + np.float32([0.2, 0, 0]), sphere, with_emd=False, diagonal_m=4.0)
+    assert result["cd_cm"] == pytest.approx(10, rel=0.03)  # gaps between points add to it
+    assert result["cd_squared_cm2"] == pytest.approx(2 * 400 / 3, rel=0.03)
+    assert result["cd_unit_cm"] == pytest.approx(result["cd_cm"] / 4)
+    assert result["f_10cm"] == pytest.approx(0.5, abs=0.02)  # |cos| is uniform
+
+
+def test_the_auction_is_within_a_percent_of_the_exact_assignment() -> None:
+    rng = np.random.default_rng(5)
+    first, second = (rng.normal(size=(400, 3)).astype(np.float32) for _ in range(2))
+    assert -1e-6 <= emd_excess(first, second, 0, 400) <= 0.01
