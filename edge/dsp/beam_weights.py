@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.dsp import tables, tdm
+from edge.dsp.buffers import zeros
 from edge.dsp.kernels_weights import level_lobes
 from edge.frames import Float64
 
@@ -73,7 +74,7 @@ class BeamWeights:
         self._level = HEADROOM * float(response.max(where=response < 1.0, initial=0.0))
         self._pair, self._of = channel_pairs(self._index)
         channels = len(element)
-        self._along, self._late, self._line = (np.zeros(n * MOST_POINTS) for n in (2 * elements, 4 * slots, 6))
+        self._along, self._late, self._line = (zeros(n * MOST_POINTS) for n in (2 * elements, 4 * slots, 6))
         self._sums, self._normal = np.zeros(self._pair.shape[1]), np.zeros((channels, channels))
         self._kept: dict[tuple[float, ...], Float64] = {}
         self.solved = 0

@@ -3,7 +3,8 @@
 
 A channel's phase towards a point is linear in its element and in its slot. Entries of the normal matrix depend on the
 differences of two channels only, and most pairs share theirs: the cascade's 144 channels have 621 different ones among
-10440 pairs. Responses are sums over slots of sums over elements. Points are innermost everywhere.
+10440 pairs. Responses are sums over slots of sums over elements. Points are innermost everywhere; sums over them are
+float32, whose rounding the ridge outweighs by far.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, njit
+from numba import boolean, float32, float64, int64, njit
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 KEPT_EMPHASIS = 0.2
-PLANE, BLOCK, WHOLE = float64[:, ::1], float64[:, :, ::1], int64[:, ::1]
+PLANE, WHOLE = float64[:, ::1], int64[:, ::1]
 
 
 @njit(inline="always")
@@ -58,15 +59,15 @@ def _normal_matrix(along, late, share, emphasis, pair, of, ridge, sums, normal):
     points = len(share)
     for s in range(late.shape[1]):
         for p in range(points):
-            scale = emphasis[p] * share[p] * share[p]
+            scale = emphasis[p] * float32(share[p] * share[p])
             late[2, s, p], late[3, s, p] = late[0, s, p] * scale, late[1, s, p] * scale
     for n in range(pair.shape[1]):
-        e, s, both, other = pair[0, n], abs(pair[1, n]), 0.0, 0.0
+        e, s, both, other = pair[0, n], abs(pair[1, n]), float32(0), float32(0)
         for p in range(points):
             both += along[0, e, p] * late[2, s, p]
         for p in range(points):
             other += along[1, e, p] * late[3, s, p]
-        sums[n] = both - other if pair[1, n] >= 0 else both + other
+        sums[n] = float64(both) - other if pair[1, n] >= 0 else float64(both) + other
     for i in range(normal.shape[0]):
         for k in range(i + 1):
             normal[i, k] = sums[of[i, k]]
@@ -99,14 +100,14 @@ def _respond(along, late, share, beyond, index, weight, part, error):  # type: i
 
     ``part`` [4, points] holds the sums of one slot and of all of them.
     """
-    points, largest = len(share), 0.0
-    part[:] = 0.0
+    points, largest = len(share), float32(0)
+    part[:] = float32(0)
     for s in range(late.shape[1]):
         for p in range(points):
-            part[0, p], part[1, p] = 0.0, 0.0
+            part[0, p], part[1, p] = float32(0), float32(0)
         for c in range(len(weight)):
             if index[1, c] == s:
-                e, w = index[0, c], weight[c]
+                e, w = index[0, c], float32(weight[c])
                 for p in range(points):
                     part[0, p] += w * along[0, e, p]
                     part[1, p] += w * along[1, e, p]
@@ -114,7 +115,7 @@ def _respond(along, late, share, beyond, index, weight, part, error):  # type: i
             part[2, p] += part[0, p] * late[0, s, p] - part[1, p] * late[1, s, p]
             part[3, p] += part[0, p] * late[1, s, p] + part[1, p] * late[0, s, p]
     for p in range(points):
-        error[p] = share[p] * np.sqrt(part[2, p] * part[2, p] + part[3, p] * part[3, p])
+        error[p] = float32(share[p]) * np.sqrt(part[2, p] * part[2, p] + part[3, p] * part[3, p])
         largest = max(largest, error[p]) if beyond[p] else largest
     return largest
 
@@ -136,7 +137,7 @@ def _reweigh(error, beyond, largest, emphasis):  # type: ignore[no-untyped-def]
 @njit(
     float64(
         *(PLANE, PLANE, boolean[::1], PLANE, WHOLE, WHOLE, WHOLE, float64, float64, float64, int64),
-        *(BLOCK, BLOCK, PLANE, float64[::1], PLANE, PLANE),
+        *(float32[:, :, ::1], float32[:, :, ::1], float32[:, ::1], float64[::1], PLANE, PLANE),
     ),
     **OPTIONS,
 )
@@ -172,7 +173,7 @@ def level_lobes(  # type: ignore[no-untyped-def]
         pair: int64 [2, pairs], different differences of two channels in elements (not negative) and in slots.
         of: int64 [n, n], which of them two channels have.
         main_lobe, ridge, level, rounds: as said, at most so many; the ridge is relative to the mean over points.
-        along, late, line: float64 [2, elements, points], [4, slots, points] and [6, points] scratch.
+        along, late, line: float32 [2, elements, points], [4, slots, points] and [6, points] scratch.
         sums, normal: float64 [pairs] and [n, n] scratch.
         weight: float64 [3, n], receives the best weights, which sum to 1, and the last; scratch.
     Returns:

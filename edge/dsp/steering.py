@@ -35,7 +35,7 @@ DENSITY_REACH = 4
 DENSITY_SHARE = 0.75
 """Density counts by sinc^2(0.75 x), whose spectrum ends at 3/4 of the grid's period: the field of view."""
 SOLVES_A_FRAME = 1
-"""Sectors whose level lobes one frame may solve for: 1 to 2.5 ms."""
+"""Sectors whose level lobes one frame may solve for: 0.5 to 1.8 ms."""
 STILL_CELLS = 0.02
 """Elements that move by less stay on the grid, which is exact in every direction."""
 
