@@ -242,22 +242,25 @@ def in_box(mesh: Mesh, xyz_m: Float32, rotation: Float64, translation_m: Float64
     return inside
 
 
-def truth_in_frame(drive: DriveBy, window: FusedCloud | None, pose: Pose | None) -> tuple[Float64, Float64]:
+def truth_in_frame(
+    drive: DriveBy, window: FusedCloud | None, pose: Pose | None, number: int = 0
+) -> tuple[Float64, Float64]:
     """Rotation [3, 3] and translation [3] from the mesh's frame into an upright frame of the reported odometry.
 
     In the middle of the window the radar saw the target at its true place; where the reported pose of that instant puts
     that place is where the truth belongs.
 
     Args:
-        drive: its first object is the target.
+        drive: its objects; the first is the target.
         window: None: the middle of the whole drive.
         pose: of the frame, upright; None: on the ground below the target's reported place.
+        number: of the object among the drive's.
     """
     span = (window.t_start_ns, window.t_end_ns) if window else drive.span_ns
     middle_ns = sum(span) // 2
     true, reported = drive.true_pose(middle_ns), drive.reported_pose(middle_ns)
     change = rotation_matrix(reported.quaternion_xyzw) @ rotation_matrix(true.quaternion_xyzw).T
-    target = drive.placed[0].at(drive.seconds(middle_ns))
+    target = drive.placed[number].at(drive.seconds(middle_ns))
     rotation: Float64 = change @ target.rotation
     place_m: Float64 = change @ (target.position_m - true.position_m) + reported.position_m
     origin_m = np.append(place_m[:2], 0.0) if pose is None else pose.position_m

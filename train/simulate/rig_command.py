@@ -8,20 +8,25 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edge.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
-    from edge.frames import Pose
+    from edge.frames import Pose, RadarFrame
     from edge.rig import Rig
+    from edge.sources.base import Loss
     from train.simulate.faults import Faults
     from train.simulate.rig import VirtualRig, VirtualRigSettings
     from train.simulate.supplies import FrameSupply
+
+
+SCENES = ("street",)
 
 
 def add_verb(verbs: Any) -> None:
@@ -36,6 +41,7 @@ def add_verb(verbs: Any) -> None:
     verb.add_argument("--object", metavar="REF", help="drive past this object, for example car/parametric_00012")
     verb.add_argument("--settings", type=Path, metavar="TOML", help="with --object: settings, instead of drawn ones")
     verb.add_argument("--poses", type=Path, metavar="FILE", help="with --object: write its reported poses as CSV too")
+    verb.add_argument("--scene", choices=SCENES, help="drive along it; street: car, motorcycle, cyclist, pedestrian")
     verb.add_argument("--frames", type=int, help="make this many frames first and repeat them (point targets: 8)")
     verb.add_argument("--seed", type=int, default=0, help="of scene and faults")
     verb.add_argument("--pace", type=float, default=1.0, help="1: real time, 2: twice as fast, 0: as fast as it goes")
@@ -47,6 +53,7 @@ def add_verb(verbs: Any) -> None:
     verb.add_argument("--fault", action="append", default=[], metavar="RULE", help="'drop vertical/data share=0.01'")
     verb.add_argument("--seconds", type=float, help="end after this time instead of at Ctrl-C")
     verb.add_argument("--source", action="store_true", help="no boards: read the simulator source, say if it kept up")
+    verb.add_argument("--pipeline", action="store_true", help="with --source: the edge pipeline runs beside it")
     verb.set_defaults(run=run)
 
 
@@ -61,13 +68,13 @@ def run(options: argparse.Namespace) -> int:
     faults = Faults(options.seed)
     for rule in options.fault:
         set_fault(faults, rule.split())
-    loaded, supply, poses = _scene(options)
+    scene = _scene(options)
     if options.source:
-        return _read_source(loaded, supply, poses, options, faults)
+        return _read_source(scene, options, faults)
     with ExitStack() as stack:
         root = options.root or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rfconstruct-rig-")))
         stop = stack.enter_context(_interrupts())
-        rig = stack.enter_context(VirtualRig(loaded, supply, root, poses, _settings(options), faults))
+        rig = stack.enter_context(VirtualRig(scene.rig, scene.supply, root, scene.poses, _settings(options), faults))
         for part, address in rig.addresses().items():
             print(f"{part:20s} {address}", flush=True)
         end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
@@ -77,52 +84,91 @@ def run(options: argparse.Namespace) -> int:
     return int(ExitCode.OK)
 
 
-def _read_source(
-    rig: Rig, supply: FrameSupply, poses: Iterable[Pose], options: argparse.Namespace, faults: Faults
-) -> int:
+def _read_source(scene: _Scene, options: argparse.Namespace, faults: Faults) -> int:
     """Read the simulator source at its pace; say how many frames came, how many late, and what it cost."""
     from edge.frames import RadarFrame
     from train.simulate.simulator_source import SimulatorSource
 
-    source = SimulatorSource(rig, supply, None, poses, pace=options.pace, faults=faults)
-    frames, first_s, last_s, cpu_s = 0, 0.0, 0.0, 0.0
+    rig = scene.rig
+    source = SimulatorSource(rig, scene.supply, scene.frames, scene.poses, pace=options.pace, faults=faults)
+    feed = _pipeline(rig) if options.pipeline else None
+    counts, first_s, last_s, cpu_s = Counter[str](), 0.0, 0.0, 0.0
     with _interrupts() as stop:
         for item in source:
             if isinstance(item, RadarFrame):
-                frames, last_s = frames + 1, time.monotonic()
-                if frames == 1:
+                counts[item.radar], last_s = counts[item.radar] + 1, time.monotonic()
+                if not first_s:
                     first_s, cpu_s = last_s, time.process_time()
-                if stop.is_set() or last_s - first_s >= (options.seconds or float("inf")):
-                    break
+            if feed is not None:
+                feed(item)
+            if stop.is_set() or last_s - first_s >= (options.seconds or float("inf")):
+                break
     load, taken_s = time.process_time() - cpu_s, max(last_s - first_s, 1e-9)
     source.close()
+    fewest, frames = min(counts.values(), default=0), counts.total()
     print(f"{frames} frames, {(frames - 1) / taken_s:.1f} a second, {100 * load / taken_s:.0f} % of one core")
+    print(f"{(fewest - 1) / taken_s:.1f} of every radar a second")
     print(f"late because they were not made in time: {source.late.total()}; asked for late: {source.slow_reads}")
-    return int(ExitCode.DEGRADED if source.late else ExitCode.OK)
+    return int(ExitCode.DEGRADED if source.late or source.slow_reads else ExitCode.OK)
 
 
-def _scene(options: argparse.Namespace) -> tuple[Rig, FrameSupply, Iterable[Pose]]:
-    """Rig, frames and poses: a drive-by past an object, or point targets again and again."""
+def _pipeline(rig: Rig) -> Callable[[RadarFrame | Pose | Loss], None]:
+    """The live road behind the source, in this thread; what it finds is printed, window by window."""
+    from edge.pipeline import FrameResult, Pipeline, WindowResult
+
+    class Print:
+        """A sink that says what stands where."""
+
+        def frame(self, result: FrameResult) -> None:
+            """Nothing of single frames."""
+
+        def window(self, result: WindowResult) -> None:
+            """Number, travel and the objects' places."""
+            places = ", ".join(
+                f"({one.pose.position_m[0]:.1f}, {one.pose.position_m[1]:.1f})" for one in result.objects
+            )
+            print(f"window of {result.cloud.travel_m:.1f} m: objects at {places or 'no place'}", flush=True)
+
+    return Pipeline(rig, None, [Print()]).feed
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """What the boards see: rig with the calibrations of its boards, frames of both radars, poses.
+
+    Args:
+        frames: of each radar; None: endless.
+    """
+
+    rig: Rig
+    supply: FrameSupply
+    poses: Iterable[Pose]
+    frames: int | None = None
+
+
+def _scene(options: argparse.Namespace) -> _Scene:
+    """A drive past an object or along a street, or point targets again and again."""
     from edge.rig import load_rig
     from train.simulate.supplies import rendered, straight_poses, targets
 
-    if options.object is None:
-        if options.settings or options.poses:
-            raise ConfigError("rig --settings, --poses", allowed="with --object only")
-        rig = load_rig(options.name)
-        return rig, targets(rig, options.frames or 8, options.seed), straight_poses(rig)
-    from train.objects.reference import ObjectRef
-    from train.simulate.cloud import DriveSpec, make_drive
-    from train.simulate.pose_stream import write_poses
-    from train.simulate.settings import read_settings
+    if options.object is not None and options.scene is not None:
+        raise ConfigError("rig", value=f"--object {options.object} --scene {options.scene}", allowed="one of them")
+    if options.scene is not None:
+        from train.simulate.street import make_street
 
-    settings = read_settings(options.settings) if options.settings else None
-    spec = DriveSpec(ObjectRef.from_text(options.object), options.seed, rig=options.name, every=1, settings=settings)
-    drive = make_drive(spec, spec.object.mesh())
-    if options.poses:
-        write_poses(options.poses, drive.poses)
-    supply = rendered(drive.rig, drive.frame, options.frames) if options.frames else drive.frame
-    return drive.rig, supply, drive.poses
+        drive = make_street(load_rig(options.name), seed=options.seed).drive
+    elif options.object is not None:
+        from train.objects.reference import ObjectRef
+        from train.simulate.cloud import DriveSpec, make_drive
+
+        spec = DriveSpec(ObjectRef.from_text(options.object), options.seed, rig=options.name, every=1)
+        drive = make_drive(spec, spec.object.mesh())
+    else:
+        rig = load_rig(options.name)
+        return _Scene(rig, targets(rig, options.frames or 8, options.seed), straight_poses(rig))
+    if options.frames:
+        return _Scene(drive.rig, rendered(drive.rig, drive.frame, options.frames), drive.poses)
+    return _Scene(drive.rig, drive.frame, drive.poses, drive.frames)
 
 
 def _settings(options: argparse.Namespace) -> VirtualRigSettings:
