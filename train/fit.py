@@ -73,7 +73,10 @@ class Trainer:
         self.teacher: Teacher | None = None
         if settings.teacher:
             self.teacher = Teacher(Path(settings.teacher), network, self.device, settings.distill)
+        self.samples_before = 0
+        """Samples that the run whose weights this one began with had seen."""
         self.state = load_checkpoint(path) if resume else self._start(network)
+        self.samples_before = int(self.state.settings.get("samples_before", 0))
         self._continue()
         network.load_state_dict(self.state.model)
         self.network = network.to(self.device)
@@ -86,15 +89,34 @@ class Trainer:
         self.board = self._board() if settings.tensorboard and self.group.leads else None
 
     def _start(self, network: CompletionModel) -> Checkpoint:
-        see = partial(in_frame, frame=network.frame)
-        network.start_from(mean_shape(self.train, network.coarse_points, see))
+        if self.settings.start:
+            self.samples_before = self._load_start(network, Path(self.settings.start))
+        else:
+            see = partial(in_frame, frame=network.frame)
+            network.start_from(mean_shape(self.train, network.coarse_points, see))
         weights = {name: value.clone() for name, value in network.state_dict().items()}
         average = {name: value.clone() for name, value in weights.items()}
         return Checkpoint(weights, average, {}, 0, 0, 0.0, self._description(), [])
 
+    @staticmethod
+    def _load_start(network: CompletionModel, path: Path) -> int:
+        """Averaged weights of another run; returns the samples it had seen."""
+        earlier = load_checkpoint(path)
+        try:
+            network.load_state_dict(earlier.average)
+        except RuntimeError as error:
+            raise ModelError(
+                f"{path}: weights of another network",
+                value=earlier.settings.get("network", "ours"),
+                action="fine-tune with the network, width and options of that run",
+            ) from error
+        return earlier.samples + int(earlier.settings.get("samples_before", 0))
+
     def _description(self) -> dict[str, Any]:
         """Settings, and what the data were drawn from; the batch is that of all processes."""
         own = {"data": self.train.description, "batch": self.settings.batch * self.group.size}
+        if self.samples_before:
+            own["samples_before"] = self.samples_before
         if self.teacher:
             own["teacher_sha256"] = self.teacher.sha256
         return asdict(self.settings) | own

@@ -27,6 +27,7 @@ NOT_IN_RESULT = (
     "log_s",
     "tensorboard",
     "teacher",
+    "start",
 )
 """Settings that may change when a run is continued (a teacher's file is compared by its content)."""
 _STILL_RUNNING = 0.9
@@ -57,6 +58,7 @@ class FitSettings:
         validation_samples: samples of the validation split, evenly spread over it.
         tensorboard: also write event files into the run folder.
         teacher: checkpoint of a trained network to learn from, "" for none.
+        start: checkpoint whose averaged weights the run begins with (fine-tuning), "" for none.
         loss, distill: see there.
     Raises:
         ConfigError: a number outside its range.
@@ -88,6 +90,7 @@ class FitSettings:
     validation_samples: int = 96
     tensorboard: bool = False
     teacher: str = ""
+    start: str = ""
     loss: LossSettings = field(default_factory=LossSettings)
     distill: DistillSettings = field(default_factory=DistillSettings)
 

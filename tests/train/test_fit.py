@@ -91,6 +91,22 @@ def test_termination_leaves_a_checkpoint(
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+def test_fine_tuning_begins_with_the_averaged_weights_of_another_run(
+    data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
+) -> None:
+    first = Trainer(replace(SETTINGS, steps=2), *data, tmp_path / "first")
+    first.run()
+    path = tmp_path / "first" / CHECKPOINT
+    second = Trainer(replace(SETTINGS, steps=2, start=str(path)), *data, tmp_path / "second")
+    for name, value in second.network.state_dict().items():
+        assert torch.equal(value, first.average[name])
+    assert second.state.step == 0
+    second.run()
+    assert load_checkpoint(tmp_path / "second" / CHECKPOINT).settings["samples_before"] == first.state.samples
+    with pytest.raises(ModelError, match="another network"):
+        Trainer(replace(SETTINGS, network="pcn", width="tiny", start=str(path)), *data, tmp_path / "third")
+
+
 def test_schedule_rises_then_falls_to_the_final_rate() -> None:
     rates = [learning_rate(p / 1000, SETTINGS) for p in range(1001)]
     peak = round(1000 * SETTINGS.warmup_share)
