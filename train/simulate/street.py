@@ -44,9 +44,10 @@ class StreetSettings:
         side_m: from the track to the kerb, behind which all stand.
         least_gap_m: between two of them along the street; more than the tracker's ``objects.neighbour_m``.
         speed_m_s, height_m: of the rig.
-        max_scatterers: of all objects together in one burst.
-        clutter_points: of the ground, see ``GroundSettings``; their mean level stays. The default leaves out seven of
-            eight, so that two cascades of 8 loops are made in real time.
+        max_scatterers, weight_step_m, visibility_step_m: see ``OpticsSettings``.
+        clutter_points: of the ground, see ``GroundSettings``; their mean level stays.
+
+    The defaults of these four are coarser than a data set's, so that a core can make two cascades of 8 loops live.
     """
 
     users: Sequence[ObjectRef] = USERS
@@ -57,6 +58,8 @@ class StreetSettings:
     height_m: float = 0.8
     max_scatterers: int = 600
     clutter_points: int = 1024
+    weight_step_m: float = 0.10
+    visibility_step_m: float = 0.20
 
     def __post_init__(self) -> None:
         require(len(self.users) > 0, "street.users", len(self.users), "at least one")
@@ -124,7 +127,7 @@ def make_street(
         rig: of two radars that looks to the left.
         settings: what stands there.
         seed: of places, headings, surfaces, front ends, odometry.
-        base: everything else; its track, number of scatterers and clutter points are replaced. None: defaults.
+        base: everything else; track, scatterers, steps and clutter points are replaced. None: defaults.
     Raises:
         ConfigError: the objects do not fit into the street.
         MeshError: no such object.
@@ -134,7 +137,8 @@ def make_street(
     frames = math.ceil(street.length_m / (street.speed_m_s * schedule.frame_period_s))
     track = TrackSettings(frames=frames, speed_m_s=street.speed_m_s, height_m=street.height_m)
     ground = replace(base.optics.ground, clutter_points=street.clutter_points)
-    optics = replace(base.optics, max_scatterers=street.max_scatterers, ground=ground)
+    optics = replace(base.optics, weight_step_m=street.weight_step_m, visibility_step_m=street.visibility_step_m)
+    optics = replace(optics, max_scatterers=street.max_scatterers, ground=ground)
     simulation = replace(base, track=track, optics=optics)
     users = _line_up(street, simulation, float(schedule.profile.wavelength_m), seed)
     return Street(users, DriveBy(rig, [user.placed for user in users], simulation, seed))
