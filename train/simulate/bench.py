@@ -68,18 +68,18 @@ def frame_cases(rig: Rig) -> list[Case]:
     """Frames of one and of both radars."""
     one = with_loops(rig.radars["horizontal"], 1)
     cases = [
-        Case(PEER_CASE, _framing([one], SCATTERERS), FRAME_GOAL_MS),
-        Case("the same, 6 cells to either side", _framing([one], SCATTERERS, width=6), FRAME_GOAL_MS),
-        Case("the same, moving", _framing([one], SCATTERERS, SPEED_M_S)),
-        Case("3000 scatterers, one radar, one loop", _framing([one], 3 * SCATTERERS)),
+        Case(PEER_CASE, framing([one], SCATTERERS), FRAME_GOAL_MS),
+        Case("the same, 6 cells to either side", framing([one], SCATTERERS, width=6), FRAME_GOAL_MS),
+        Case("the same, moving", framing([one], SCATTERERS, SPEED_M_S)),
+        Case("3000 scatterers, one radar, one loop", framing([one], 3 * SCATTERERS)),
     ]
     boards = [with_loops(rig.radars[radar], 8) for radar in RADARS]
-    cases.append(Case("1000 scatterers, both radars, 8 loops", _framing(boards, SCATTERERS), BOTH_GOAL_MS))
-    cases.append(Case("the same, 8 loops moving", _framing(boards, SCATTERERS, SPEED_M_S)))
+    cases.append(Case("1000 scatterers, both radars, 8 loops", framing(boards, SCATTERERS), BOTH_GOAL_MS))
+    cases.append(Case("the same, 8 loops moving", framing(boards, SCATTERERS, SPEED_M_S)))
     return cases
 
 
-def _framing(radars: list[Radar], count: int, speed_m_s: float = 0.0, width: int = 4) -> Callable[[], object]:
+def framing(radars: list[Radar], count: int, speed_m_s: float = 0.0, width: int = 4) -> Callable[[], object]:
     """Call that makes a new frame of every radar, with all default faults of the front end."""
     parts = []
     for radar in radars:
@@ -155,7 +155,7 @@ def _rms_db(found: Any, expected: Any) -> float:
 
 def memory(radar: Radar) -> dict[str, Any]:
     """Resident memory before and after many frames."""
-    call = _framing([radar], SCATTERERS, SPEED_M_S)
+    call = framing([radar], SCATTERERS, SPEED_M_S)
     call()
     before_mb = resident_mb()
     for _ in range(MEMORY_FRAMES):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +16,13 @@ from edge.pipeline import Pipeline
 from edge.rig import load_rig
 from edge.timing import StageTimes
 from train.objects.reference import ObjectRef
-from train.simulate.bench import Case, resident_mb
+from train.simulate.bench import Case, framing, resident_mb
 from train.simulate.cloud import Windows
 from train.simulate.drive_by import DriveBy
 from train.simulate.scene import make_scene
 from train.simulate.settings import SceneSettings, SimulationSettings, TrackSettings
 from train.simulate.stages import SharedStages
+from train.simulate.street import make_street
 
 if TYPE_CHECKING:
     from edge.rig import Rig
@@ -31,9 +32,9 @@ if TYPE_CHECKING:
 DEMO = "cascade_demo"
 """Rig with one loop, of which data sets are made."""
 FRAMES, TRAVEL_M = 300, 3.0
-DRIVE_GOAL_MS, SUPPLY_GOAL_MS = 4000.0, 6.0
+DRIVE_GOAL_MS, LIVE_GOAL_MS = 4000.0, 6.0
 TARGET = ObjectRef("car", "parametric_00012")
-SUPPLY_FRAMES, SUPPLY_SCATTERERS = 60, 600
+LIVE_SCATTERERS, LIVE_SPEED_M_S = 600, 1.5
 MEMORY_DRIVES, WARM_DRIVES = 6, 3
 
 
@@ -67,13 +68,11 @@ class Bench:
         rig: how it is driven past.
         every: only each n-th frame.
         neighbours: objects beside the target.
-        max_scatterers: about this many, two thirds of them at the target; None: the default settings.
     """
 
     rig: Rig
     every: int = 1
     neighbours: int = 1
-    max_scatterers: int | None = None
     mesh: Mesh | None = None
     stages: SharedStages | None = None
     seed: int = 0
@@ -87,10 +86,6 @@ class Bench:
         scene = SceneSettings(side_m=4.0, yaw_deg=20.0, neighbours=self.neighbours)
         track = TrackSettings(frames=FRAMES, every=self.every, speed_m_s=TRAVEL_M / duration_s)
         settings = SimulationSettings(track=track, scene=scene)
-        if self.max_scatterers is not None:
-            ground = replace(settings.optics.ground, clutter_points=self.max_scatterers)
-            optics = replace(settings.optics, max_scatterers=2 * self.max_scatterers // 3, ground=ground)
-            settings = replace(settings, optics=optics)
         placed = self._place(settings, duration_s)
         return DriveBy(self.rig, placed, settings, self.seed, self.stages.synthesizers(self.rig))
 
@@ -122,21 +117,26 @@ def _nothing() -> Iterator[None]:
 
 
 def drive_cases(rig: Rig) -> list[Case]:
-    """Whole drive-bys with one loop, then with the rig's own loops; a pair of frames for the live source."""
+    """Whole drive-bys with one loop, then with the rig's own loops; what the live source makes sixty times a second."""
     demo = load_rig(DEMO)
     loops = rig.radars["horizontal"].schedule.loops
     return [
         Case(f"drive-by of {FRAMES} frames through the pipeline, one loop", Bench(demo).run, DRIVE_GOAL_MS),
         Case("the same, every third frame", Bench(demo, every=3).run),
         Case(f"the same, every third frame, {loops} loops", Bench(rig, every=3).run),
-        Case(f"a pair of frames of a drive-by, about {SUPPLY_SCATTERERS} scatterers, one loop", supplying(demo)),
-        Case(f"the same, {loops} loops", supplying(rig), SUPPLY_GOAL_MS),
+        Case(
+            f"{LIVE_SCATTERERS} scatterers at {LIVE_SPEED_M_S:g} m/s, both radars, {loops} loops",
+            framing(list(rig.radars.values()), LIVE_SCATTERERS, LIVE_SPEED_M_S),
+            LIVE_GOAL_MS,
+        ),
+        Case("a pair of frames of the street, one loop", supplying(demo)),
+        Case(f"a pair of frames of the street, {loops} loops", supplying(rig)),
     ]
 
 
 def supplying(rig: Rig) -> Callable[[], object]:
     """Call that makes the next frame of both radars: optics, synthesis, front end; neighbouring frames as they come."""
-    drive = Bench(rig, neighbours=0, max_scatterers=SUPPLY_SCATTERERS).drive()
+    drive = make_street(rig).drive
     number = 0
 
     def call() -> None:
@@ -184,6 +184,6 @@ def drive_report(rig: Rig) -> dict[str, Any]:
 
 def scatterers_of(rig: Rig) -> float:
     """Mean number of scatterers of a radar's burst in ``supplying``."""
-    drive = Bench(rig, neighbours=0, max_scatterers=SUPPLY_SCATTERERS).drive()
+    drive = make_street(rig).drive
     counts = [len(drive.scatterers(radar, number)[0]) for number in range(0, drive.frames, 30) for radar in RADARS]
     return float(np.mean(counts))

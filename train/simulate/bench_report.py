@@ -112,8 +112,8 @@ def _drive(drive: Result) -> Iterator[str]:
     memory = drive["memory"]
     yield (
         "A parametric car, a neighbour and the ground with default settings; scene and surfaces are made anew in each "
-        "drive-by. *A pair of frames* in the table above, for the live source, passes the car alone with fewer points "
-        f"of the ground: {drive['scatterers']:.0f} scatterers a burst on average. Resident before and after "
+        "drive-by. *The street*: four objects passed at 1.5 m/s (`rig --scene street`), "
+        f"{drive['scatterers']:.0f} scatterers a burst on average, optics included. Resident before and after "
         f"{memory['drives']} drive-bys, after some others: {memory['before_mb']:.0f} and {memory['after_mb']:.0f} MB."
     )
     yield ""
