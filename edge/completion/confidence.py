@@ -47,12 +47,12 @@ def measures(
     frames: int,
     sigma_m: float | None = None,
 ) -> dict[str, float]:
-    """What is known of an answer without the truth; some 2 ms, the same numbers for any heading.
+    """What is known of an answer without the truth; half a millisecond, the same numbers for any heading.
 
     Args:
         points_m: float32 [n, 3], n >= 1, what the network saw; z up, ground 0, metres.
         fine_m: float32 [m, 3], m >= 1, its answer in the same frame.
-        probability: of the classes, in the manifest's order; None: the network has no classifier.
+        probability: of the classes, in the manifest's order; None or empty: the network has no classifier.
         frames: of the window.
         sigma_m: the network's own mean uncertainty of a point, where it gives one.
     Returns:
@@ -66,13 +66,13 @@ def measures(
     """
     rows, surface = _some(points_m, _INPUT_ROWS), _some(fine_m, _SURFACE_ROWS)
     squared = _squared_distances(rows, surface)
-    forth = np.sqrt(squared.min(axis=1))
-    back = np.sqrt(squared.min(axis=0))
+    forth = np.sqrt(np.maximum(squared.min(axis=1), 0))
+    back = np.sqrt(np.maximum(squared.min(axis=0), 0))
     long_m, wide_m = _axes(points_m)
     result = {
         "points": math.log2(len(points_m) / 256),
         "frames": math.log2(min(max(frames, 1), FULL_WINDOW_FRAMES) / FULL_WINDOW_FRAMES),
-        **({} if probability is None else _of_classes(np.asarray(probability, dtype=np.float64))),
+        **({} if probability is None or len(probability) == 0 else _of_classes(np.asarray(probability, np.float64))),
         "near": float((forth < NEAR_M).mean()),
         "seen": float((back < SEEN_M).mean()),
         "below": float((points_m[:, 2] < -NEAR_M).mean()),
@@ -106,8 +106,10 @@ def _squared_distances(first: Float32, second: Float32) -> Float32:
     """All squared distances [n, m], float32; both clouds are centred first, so that rounding stays below 1 mm."""
     middle = second.mean(axis=0)
     a, b = first - middle, second - middle
-    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
-    result: Float32 = np.maximum(squared, 0)
+    ones = np.ones((len(a), 1), np.float32), np.ones((len(b), 1), np.float32)
+    left = np.concatenate([a, (a * a).sum(axis=1, keepdims=True), ones[0]], axis=1)
+    right = np.concatenate([-2 * b, ones[1], (b * b).sum(axis=1, keepdims=True)], axis=1)
+    result: Float32 = left @ right.T
     return result
 
 
