@@ -199,6 +199,8 @@ class CompletionNetwork(CompletionModel):
     def start_from(self, shape_m: Float32) -> None:
         """Make the untrained network answer with this shape: it becomes the bias of the coarse decoder's last layer.
 
+        What the folding adds begins small, or its random bias would move everything by half a metre.
+
         Args:
             shape_m: float32 [coarse points, 3], unit of the input; from the centre of the input, z from the ground.
         """
@@ -206,6 +208,8 @@ class CompletionNetwork(CompletionModel):
         require(shape_m.shape == allowed, "start shape", shape_m.shape, str(allowed))
         self.coarse3.bias.copy_((torch.from_numpy(shape_m) / self.scale).flatten())
         self.coarse3.weight.mul_(0.1)
+        self.fold3.weight.mul_(0.1)
+        self.fold3.bias.zero_()
 
     def forward(self, points_m: Tensor, counts: Sequence[int], cells: Tensor | None = None) -> Completion:
         """See ``CompletionModel.forward``."""

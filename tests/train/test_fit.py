@@ -6,18 +6,25 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from edge.errors import ConfigError, ModelError
-from train.batches import Order, endless
+from train.batches import Order, collate, endless, in_frame
 from train.checkpoint import load_checkpoint
 from train.dataset import CompletionDataset, DatasetSettings
+from train.distill import DistillSettings
 from train.fit import CHECKPOINT, FitSettings, Trainer, learning_rate
 from train.losses import LossSettings
+from train.nearest import nearest_distance
+from train.networks.registry import of_checkpoint
+from train.perturb_settings import PerturbSettings
 
 DATA = DatasetSettings(truth_points=512, max_points=200, epoch_samples=24, parametric_objects=1, evaluation_views=1)
 SETTINGS = FitSettings(
@@ -171,3 +178,169 @@ def test_order_of_an_epoch_is_a_permutation_that_can_start_anywhere() -> None:
 def test_settings_that_cannot_work_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         replace(SETTINGS, **change)  # type: ignore[arg-type]
+
+
+def test_a_larger_budget_stretches_the_schedule_and_never_turns_it_back(
+    data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
+) -> None:
+    trainer = Trainer(replace(SETTINGS, steps=0, budget_s=100), *data, tmp_path)
+    trainer.state.elapsed_s = 40
+    trainer.save()
+    longer = Trainer(replace(SETTINGS, steps=0, budget_s=400), *data, tmp_path, resume=True)
+    assert longer.progress == pytest.approx(0.4)
+    longer.state.elapsed_s = 220
+    assert longer.progress == pytest.approx(0.7)
+    longer.save()
+    shorter = Trainer(replace(SETTINGS, steps=0, budget_s=250), *data, tmp_path, resume=True)
+    assert shorter.progress == pytest.approx(0.7)
+    shorter.state.elapsed_s = 250
+    assert shorter.progress == 1
+    shorter.save()
+    again = Trainer(replace(SETTINGS, steps=0, budget_s=500), *data, tmp_path, resume=True)
+    assert again.progress == pytest.approx(0.5)  # over, and taken up again
+    again.save()
+    assert Trainer(replace(SETTINGS, steps=0, budget_s=500), *data, tmp_path, resume=True).progress == again.progress
+
+
+def test_a_stopped_run_goes_on_as_if_it_had_not_stopped(
+    data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, steps=4)
+    whole = Trainer(settings, *data, tmp_path / "whole")
+    whole.run()
+    for count in range(1, 5):
+        leg = Trainer(replace(settings, stop_after_s=1e-6), *data, tmp_path / "legs", resume=count > 1)
+        leg.run()
+        assert leg.state.step == count
+    for name, value in whole.average.items():
+        assert torch.equal(value, leg.average[name]), name
+
+
+@pytest.mark.parametrize(("network", "precision"), [("pcn", "fp32"), ("adapointr", "fp32"), ("ours", "bf16")])
+def test_every_network_trains_and_continues_exactly(
+    network: str, precision: str, data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, network=network, precision=precision)
+    whole = Trainer(settings, *data, tmp_path / "whole")
+    before = whole.validate()["cd_macro_cm"]
+    steps(whole, 4)
+    broken = Trainer(settings, *data, tmp_path / "broken")
+    steps(broken, 2)
+    broken.save()
+    continued = Trainer(settings, *data, tmp_path / "broken", resume=True)
+    steps(continued, 2)
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(value, continued.network.state_dict()[name]), name
+    assert whole.validate()["cd_macro_cm"] < 1.5 * before
+    continued.save()
+    loaded = of_checkpoint(load_checkpoint(tmp_path / "broken" / CHECKPOINT))
+    assert loaded.parameter_count == whole.network.parameter_count
+
+
+def test_other_options_are_another_run(data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path) -> None:
+    Trainer(SETTINGS, *data, tmp_path).save()
+    with pytest.raises(ConfigError, match=r"fit\.options"):
+        Trainer(replace(SETTINGS, options={"mirror": "plane"}), *data, tmp_path, resume=True)
+    with pytest.raises(ConfigError, match="different frames"):
+        Trainer(replace(SETTINGS, frame="box"), *data, tmp_path / "box")
+
+
+def test_box_frame_puts_every_object_into_the_unit_sphere() -> None:
+    dataset = CompletionDataset("train", replace(DATA, box_frame=True, truth_points=4000), 0)
+    for index in range(4):
+        sample = in_frame(dataset[index], "box")
+        radius = np.linalg.norm(sample.truth, axis=1).max()
+        size = sample.truth.max(0) - sample.truth.min(0)
+        assert 0.25 < radius <= 0.5001
+        assert 0.9 < np.linalg.norm(size) <= 1.0001
+        np.testing.assert_allclose((sample.truth.max(0) + sample.truth.min(0)) / 2, 0, atol=0.03)
+
+
+def test_powers_are_a_column_and_points_without_are_average() -> None:
+    sample = CompletionDataset("train", DATA, 0)[0]
+    power = np.linspace(-9, 9, len(sample.partial), dtype=np.float32)
+    batch = collate([sample, replace(sample, power_db=power)], columns=4)
+    assert batch.points_m.shape == (2 * len(power), 4)
+    assert not batch.points_m[: len(power), 3].any()
+    np.testing.assert_array_equal(batch.points_m[len(power) :, 3], power)
+
+
+def test_scans_of_pcn_lie_on_the_visible_surface_and_ours_do_not() -> None:
+    clean = replace(
+        DATA, perturbation=PerturbSettings.clean(), truth_points=30_000, sight_sigma_deg=0, ground_sigma_m=0
+    )
+    for index in range(4):
+        sample = CompletionDataset("train", clean, 0)[index]
+        assert nearest_distance(sample.partial, sample.truth).max() < 0.08
+    noisy = CompletionDataset("train", replace(DATA, truth_points=30_000), 0)[0]
+    assert nearest_distance(noisy.partial, noisy.truth).max() > 0.08
+    assert "perturbation" in CompletionDataset("train", clean, 0).description
+
+
+def test_a_teacher_pulls_the_student(data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path) -> None:
+    wide = Trainer(replace(SETTINGS, network="paper", steps=2), *data, tmp_path / "wide")
+    wide.run()
+    path = str(tmp_path / "wide" / CHECKPOINT)
+    only = replace(SETTINGS, teacher=path, distill=DistillSettings(fine=1.0))
+    student = Trainer(only, *data, tmp_path / "student")
+    assert student.teacher is not None
+    batch = next(student.batches(0))
+    with torch.no_grad():
+        taught = student.teacher.network(batch.points_m, batch.counts)
+        same = student.teacher.loss(batch, taught, 16, student.matcher, torch.Generator())
+        own = student.network(batch.points_m, batch.counts)
+        away = student.teacher.loss(batch, own, 16, student.matcher, torch.Generator())
+    assert float(same) == pytest.approx(0, abs=1e-5)
+    assert float(away) > 1e-3
+    steps(student, 2)
+    student.save()
+    wide.state.samples += 1
+    wide.save()
+    with pytest.raises(ConfigError, match="teacher_sha256"):
+        Trainer(only, *data, tmp_path / "student", resume=True)
+
+
+WORKER = """
+import sys, torch
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_fit import DATA, SETTINGS, CompletionDataset, Trainer, replace
+if __name__ == "__main__":
+    settings = replace(SETTINGS, batch=2, steps=3)
+    data = CompletionDataset("train", DATA, 0), CompletionDataset("val", DATA, 0)
+    trainer = Trainer(settings, *data, Path(sys.argv[1]))
+    trainer.run()
+    weights = torch.cat([value.flatten() for value in trainer.network.state_dict().values()])
+    both = [torch.empty_like(weights) for _ in range(2)]
+    torch.distributed.all_gather(both, weights)
+    assert torch.equal(*both)
+    trainer.group.close()
+"""
+
+
+def test_two_processes_take_the_steps_of_one_with_the_double_batch(
+    data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
+) -> None:
+    (tmp_path / "worker.py").write_text(WORKER)
+    run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    arguments = [str(tmp_path / "worker.py"), str(tmp_path / "two"), str(Path(__file__).parent)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(
+        [*run, *arguments], env=environment, capture_output=True, text=True, timeout=250, check=False
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    one = Trainer(replace(SETTINGS, batch=4, steps=3), *data, tmp_path / "one")
+    one.run()
+    two = load_checkpoint(tmp_path / "two" / CHECKPOINT)
+    assert (two.step, two.samples, two.settings["batch"]) == (3, 12, 4)
+    for name, value in one.network.state_dict().items():
+        torch.testing.assert_close(two.model[name], value, atol=2e-4, rtol=0)
+    assert two.history[-1]["cd_macro_cm"] == pytest.approx(one.state.history[-1]["cd_macro_cm"], rel=0.01)
+    assert len((tmp_path / "two" / "log.jsonl").read_text().splitlines()) == 1
+    continued = Trainer(replace(SETTINGS, batch=4, steps=5), *data, tmp_path / "two", resume=True)
+    assert continued.run()[-1]["samples"] == 20
+
+
+def test_shares_of_the_processes_are_the_large_batch() -> None:
+    whole, parts = list(Order(23, 6, 1)), [list(Order(23, 3, 1, rank, 2)) for rank in (0, 1)]
+    assert [a + b for a, b in zip(*parts, strict=True)] == whole

@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
+from torch import Tensor
 
 from edge.errors import ConfigError
 from edge.frames import Float32
 from train.auction import assign
-from train.losses import LossSettings, Matcher, alpha, chamfer, completion_loss, emd
+from train.auction_batched import assign_batched
+from train.losses import LossSettings, Matcher, alpha, chamfer, completion_loss, emd, nearest_blocks
 from train.nearest import nearest_distance
 from train.network import SCALE_M, Completion
 
@@ -127,3 +129,101 @@ def test_total_is_the_weighted_sum_and_the_ramp_rises(matcher: Matcher) -> None:
     assert float(terms.total) == pytest.approx(float(terms.coarse + 0.5 * terms.fine + 0.02 * terms.label))
     assert float(terms.fine) == pytest.approx(float(chamfer(truth * 1.05, truth, matcher)) / SCALE_M, rel=1e-4)
     assert [alpha(p) for p in (0, 0.0999, 0.1, 0.3, 1)] == [0.1, 0.1, 0.5, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(("points", "tolerance"), [(1, 0.01), (2, 0.01), (64, 0.01), (256, 0.01), (256, 0.05)])
+def test_batched_auction_is_within_its_tolerance_of_the_optimum(points: int, tolerance: float) -> None:
+    rng = np.random.default_rng(points)
+    first = np.stack([surface(rng, points) for _ in range(3)])
+    second = np.stack([surface(rng, points, (2.0, 1.0, 0.6)) + np.float32(shift) for shift in (0, 0.05, 3)])
+    second[0] = first[0][rng.permutation(points)]
+    partner = assign_batched(torch.tensor(first), torch.tensor(second), tolerance).numpy()
+    for one, other, chosen in zip(first, second, partner, strict=True):
+        cost = cdist(one, other)
+        rows, columns = linear_sum_assignment(cost)
+        assert sorted(chosen) == list(range(points))
+        allowed = (1 + tolerance) * cost[rows, columns].mean() + 1e-4 * cost.max() / 8
+        assert cost[np.arange(points), chosen].mean() <= allowed
+
+
+def test_batched_auction_refuses_what_it_cannot_match() -> None:
+    cloud = torch.zeros(2, 8, 3)
+    assert sorted(assign_batched(cloud, cloud)[1].tolist()) == list(range(8))
+    for other in (cloud[:, :7], cloud + torch.nan):
+        with pytest.raises(ConfigError):
+            assign_batched(cloud, other)
+
+
+def test_neighbours_by_blocks_equal_the_k_d_tree() -> None:
+    rng = np.random.default_rng(5)
+    query, target = surface(rng, 5000) * np.float32(1.05) + 40, surface(rng, 700) + 40
+    index = nearest_blocks(torch.tensor(query)[None], torch.tensor(target)[None])[0].numpy()
+    expected, _ = cKDTree(target.astype(float)).query(query.astype(float))
+    found = np.linalg.norm(query.astype(float) - target[index], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def parts(**changes: Tensor | None) -> tuple[Completion, Tensor]:
+    rng = np.random.default_rng(6)
+    truth = torch.tensor(np.stack([surface(rng, 600) for _ in range(2)]))
+    return Completion(truth, truth * 1.1, torch.zeros(2, 4), **changes), truth  # type: ignore[arg-type]
+
+
+def total(output: Completion, truth: Tensor, matcher: Matcher, **changes: object) -> Tensor:
+    settings = LossSettings(**changes)  # type: ignore[arg-type]
+    generator = torch.Generator().manual_seed(0)
+    return completion_loss(output, truth, torch.tensor([0, 3]), 1.0, settings, matcher, generator).total
+
+
+def test_class_weights_weigh_the_samples_of_a_class(matcher: Matcher) -> None:
+    output, truth = parts()
+    each = [
+        float(total(Completion(*(x[i : i + 1].repeat(2, 1, 1) for x in output[:2]), output.logits),
+                    truth[i : i + 1].repeat(2, 1, 1), matcher, beta=0.0))
+        for i in range(2)
+    ]  # fmt: skip
+    weighted = float(total(output, truth, matcher, beta=0.0, class_weights=(3.0, 2.0, 2.0, 1.0)))
+    assert weighted == pytest.approx((1.5 * each[0] + 0.5 * each[1]) / 2, rel=1e-5)
+    for bad in ((1.0, 1.0), (1.0, 1.0, 0.0, 1.0)):
+        with pytest.raises(ConfigError, match="class_weights"):
+            LossSettings(class_weights=bad)
+
+
+def test_expected_distance_is_learned_without_moving_points_unless_asked(matcher: Matcher) -> None:
+    log_sigma = torch.full((2, 600), -3.0, requires_grad=True)
+    output, truth = parts(log_sigma=log_sigma)
+    fine = output.fine.clone().requires_grad_()
+    output = output._replace(fine=fine)
+    distance = chamfer_forth(fine.detach(), truth) / SCALE_M
+    for joint in (False, True):
+        loss = total(output, truth, matcher, gamma=1.0, joint=joint) - total(output, truth, matcher, gamma=0.0)
+        gradient, moved = torch.autograd.grad(loss, (log_sigma, fine))
+        expected = (1 - distance * np.exp(3.0)) / 1200
+        np.testing.assert_allclose(gradient.numpy(), expected, rtol=1e-3, atol=1e-6)
+        assert (moved.abs().max() > 1e-6) == joint
+
+
+def chamfer_forth(prediction: Tensor, truth: Tensor) -> np.ndarray:
+    return np.stack([nearest_distance(p, t) for p, t in zip(prediction.numpy(), truth.numpy(), strict=True)])
+
+
+def test_plane_of_symmetry_is_found_by_descent(matcher: Matcher) -> None:
+    rng = np.random.default_rng(8)
+    half = surface(rng, 400)
+    cloud = np.concatenate([half, half * [1, -1, 1]]).astype(np.float32)
+    cloud[:, 0] += np.abs(cloud[:, 2]) * 0.4 + 0.3 * np.sign(cloud[:, 0])  # no other vertical plane
+    cloud = cloud[rng.permutation(800)]
+    angle = np.float32(0.4)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], np.float32)
+    truth = torch.tensor(cloud @ turn.T)[None].repeat(2, 1, 1)
+    raw = torch.tensor([0.0, 1.0, 0.02], requires_grad=True)
+    optimizer = torch.optim.Adam([raw], 0.02)
+    for _ in range(60):
+        plane = torch.cat([torch.nn.functional.normalize(raw[:2], dim=0), raw[2:]]).expand(2, 3)
+        output = Completion(truth, truth, torch.zeros(2, 4), plane=plane, center=torch.zeros(2, 3))
+        optimizer.zero_grad()
+        total(output, truth, matcher, symmetry=1.0).backward()
+        optimizer.step()
+    x, y, offset = raw.tolist()
+    assert np.arctan2(-x, y) == pytest.approx(angle, abs=0.05)
+    assert offset == pytest.approx(0, abs=0.02)
