@@ -94,6 +94,8 @@ class CfarSettings:
         sidelobe_guard: leave out detections that the windows' sidelobes of a stronger detection explain.
         sidelobe_margin_db: how far above those sidelobes a detection must stand; 6 dB is what two equal ones add up to.
         min_range_m: cells nearer are not tested (transmit leakage).
+        max_range_m: cells farther hold no detections; 0: the range that the IF filter passes, 0.9 of the largest. What
+            lies beyond is mostly leakage that wraps round the range axis.
         max_detections: strongest kept per radar and frame.
     """
 
@@ -108,6 +110,7 @@ class CfarSettings:
     sidelobe_guard: bool = True
     sidelobe_margin_db: float = 6.0
     min_range_m: float = 0.6
+    max_range_m: float = 0.0
     max_detections: int = 512
 
     def __post_init__(self) -> None:
@@ -124,6 +127,8 @@ class CfarSettings:
         require(0.0 < self.os_quantile < 1.0, "cfar.os_quantile", self.os_quantile, "between 0 and 1")
         require(0 <= self.sidelobe_margin_db <= 30, "cfar.sidelobe_margin_db", self.sidelobe_margin_db, "0..30")
         require(self.min_range_m >= 0, "cfar.min_range_m", self.min_range_m, ">= 0")
+        farther = self.max_range_m == 0 or self.max_range_m > self.min_range_m
+        require(farther, "cfar.max_range_m", self.max_range_m, "0 or more than cfar.min_range_m")
         require(self.max_detections > 0, "cfar.max_detections", self.max_detections, "> 0")
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ class PointResponse:
             distance in bins away from its peak (edge/dsp/tables.py); level: what focusing leaves of the wavefront's
             curvature, |(1 - u^2) / (2 r) - focus|, in steps of 0.01 / m; None: unknown.
         range_spread_bins: half the spread of the row's ranges to a target at direction cosine 1.
+        usable_range_m: what the IF filter passes; echoes that seem to be farther are something else.
     """
 
     range_fit: Float64
@@ -41,6 +43,7 @@ class PointResponse:
     range_envelope: Float64 | None = None
     angle_envelope: Float64 | None = None
     range_spread_bins: float = 0.0
+    usable_range_m: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,15 +31,18 @@ from edge.frames import Detections, Float32, Float64, Heatmap, PointResponse
 if TYPE_CHECKING:
     from edge.rig import Radar
 
+NEVER = np.float32(1e25)
+"""Threshold factor that no cell exceeds; its product with any power stays finite."""
+
 
 class Detector:
     """CFAR detection, local maxima and sub-bin estimation for one radar.
 
     The noise around a cell comes from a ring in range and angle, wrapped in angle, cut at both ends of range and at
     ``min_range_m``; each remaining ring has its own factor for the same designed probability, by the effective number
-    of its cells, which windows and zero padding correlate. Everything is decided, and maxima are sought and
-    interpolated, on the power as received, before the compensation of the antenna pattern: that would tilt the noise of
-    a ring and draw the peak of a wide lobe aside.
+    of its cells, which windows and zero padding correlate. Cells beyond ``max_range_m`` count in rings but hold no
+    detections. Everything is decided, and maxima are sought and interpolated, on the power as received, before the
+    compensation of the antenna pattern: that would tilt the noise of a ring and draw the peak of a wide lobe aside.
 
     Args:
         radar: which radar; only its identity is used, axes come with the heatmap.
@@ -139,7 +142,7 @@ class Detector:
         train = self.settings.train_angle
         require(2 * train < angles, "cfar.train_angle", train, f"at most {(angles - 1) // 2} for {angles} angle bins")
         self._first = int(np.searchsorted(range_m, self.settings.min_range_m))
-        self._tables, self._maps = RingTables.of(self.settings, ranges, self._first), None
+        self._tables, self._maps = self._tables_of(ranges), None
         self._factors.clear()
         self._reserve_means(angles, ranges)
         self._cells = np.zeros(angles * (ranges + 1) // 4 + 1, dtype=np.int64)
@@ -192,7 +195,16 @@ class Detector:
             if response is not None and response.angle_correlation is not None:
                 correlation[0] = np.square(np.abs(response.angle_correlation))
         maximum = Maximum.of(correlation)
-        return RingTables.of(self.settings, self._shape[1], self._first, response, maximum).factor
+        return self._tables_of(self._shape[1], response, maximum).factor
+
+    def _tables_of(
+        self, ranges: int, response: PointResponse | None = None, maximum: Maximum | None = None
+    ) -> RingTables:
+        """Tables of the rings, with a factor beyond the largest range that nothing exceeds."""
+        tables = RingTables.of(self.settings, ranges, self._first, response, maximum)
+        farthest_m = self.settings.max_range_m or (np.inf if response is None else response.usable_range_m)
+        tables.factor[self._axes[0] + self._axes[1] * np.arange(ranges) > farthest_m] = NEVER
+        return tables
 
     def _take_over(self, response: PointResponse | None) -> None:
         self._pattern[:] = 1.0
@@ -204,7 +216,7 @@ class Detector:
             self._axes[4:7] = response.range_bias_m2, response.cosine_bias_m, response.focus_inverse_m
             self._axes[7] = response.range_spread_bins
             self._look_up_sidelobes(response)
-        self._tables, self._maps = RingTables.of(self.settings, self._shape[1], self._first, response), None
+        self._tables, self._maps = self._tables_of(self._shape[1], response), None
         self._factors.clear()
 
     def _look_up_sidelobes(self, response: PointResponse) -> None:

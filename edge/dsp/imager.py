@@ -165,6 +165,7 @@ class Imager:
                 bins=self.settings.angle_bins,
             ),
             range_spread_bins=float(np.abs(p[inside]).max() / (2.0 * bin_m)),
+            usable_range_m=self.radar.schedule.profile.usable_range_m,
         )
 
     def _make_buffers(self) -> None:

@@ -65,6 +65,19 @@ def test_equal_neighbours_give_one_detection():
     assert len(Detector(RADAR, CfarSettings()).process(map_)) == 1
 
 
+@pytest.mark.parametrize("kind", ["ca", "go", "so", "os"])
+def test_nothing_is_found_beyond_the_range_that_the_receiver_passes(kind):
+    """0.9 of 15.2 m are 13.7 m; leakage a little before range 0 stands at the end of the closed range axis."""
+    radar = cascade_radar()
+    imager = Imager(radar, HeatmapSettings(), FLAT)
+    scene = [place(13.4, 10.0), place(14.4, -10.0), place(15.1, 0.0)]
+    map_ = imager.process(make_frame(radar, scene, 300.0, 0, 0, noise_lsb=25.0))
+    found = Detector(radar, CfarSettings(kind=kind)).process(map_)
+    np.testing.assert_allclose(found.range_m, [13.4], atol=0.01)
+    farther = Detector(radar, CfarSettings(kind=kind, max_range_m=14.6)).process(map_)
+    np.testing.assert_allclose(np.sort(farther.range_m), [13.4, 14.4], atol=0.01)
+
+
 @pytest.mark.parametrize("column", [12, 95])
 def test_first_and_last_range_cell_can_detect(column):
     map_ = bumps([(60, column)], [9.0])
