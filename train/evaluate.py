@@ -10,15 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 
 from edge.completion.model import UNKNOWN
+from edge.completion.network import Network
 from edge.errors import ModelError
 from edge.frames import Float32
 from train.baselines import FLOOR, Bank, floor
+from train.batches import collate
 from train.dataset import CLASSES, CompletionDataset, Sample
 from train.held_out import Case, HeldOut, spread
 from train.metrics import Summary, shape_metrics, summarize
+from train.network import Frame
 from train.predictors import Answer, Predictor
 
 __all__ = ["BIKE", "FLOOR", "MACRO", "PAPER", "OnnxModel", "Scores", "evaluate", "int8_is_good", "measure", "spread"]
@@ -35,25 +37,39 @@ class OnnxModel:
 
     Args:
         path: .onnx file.
+        frame: of its input; "box": clouds are divided by the object's diagonal.
     Raises:
         ModelError: absent or not loadable.
     """
 
-    def __init__(self, path: Path) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
+    def __init__(self, path: Path, frame: Frame = "sight") -> None:
+        self.frame = frame
         try:
-            self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:
-            raise ModelError(
-                f"{path.name}: no loadable model ({type(error).__name__})", action="export again"
-            ) from error
+            self.network = Network(path.read_bytes(), path.name)
+        except OSError as error:
+            raise ModelError(f"{path.name}: no loadable model ({error})", action="export again") from error
 
     def __call__(self, points_m: Float32) -> tuple[Float32, Float32, Float32]:
-        """Fine [16384, 3] and coarse [1024, 3] points in metres and class probabilities of one cloud [n, 3]."""
-        fine, coarse, probability = self.session.run(["fine", "coarse", "class_probability"], {"points": points_m})
-        return fine, coarse, probability
+        """Fine [fine, 3] and coarse [coarse, 3] points in metres and class probabilities of one cloud [n, 3]."""
+        answer = self.network.run(points_m)
+        return answer.fine_m, answer.coarse_m, answer.probability
+
+    @property
+    def columns(self) -> int:
+        """Of an input point."""
+        return self.network.signature["points"][1][1] or 3
+
+    @property
+    def has_classes(self) -> bool:
+        """Whether the graph has a classifier."""
+        return "class_probability" in self.network.signature
+
+    def of(self, sample: Sample) -> Answer:
+        """The answer to a sample, metres."""
+        points = collate([sample], self.frame, self.columns).points_m.numpy()
+        scale_m = np.float32(np.linalg.norm(sample.size_m)) if self.frame == "box" else np.float32(1)
+        fine, coarse, probability = self(points)
+        return Answer(fine * scale_m, coarse * scale_m, probability if self.has_classes else None)
 
 
 @dataclass(slots=True)
@@ -194,14 +210,14 @@ def evaluate(
 
 
 def _bare(model: OnnxModel) -> Predictor:
-    return lambda case: Answer(*model(case.sample.partial))
+    return lambda case: model.of(case.sample)
 
 
 def _shifts(models: dict[str, OnnxModel], dataset: CompletionDataset, indices: list[int]) -> dict[str, list[float]]:
     """Rms displacement in cm of every model's fine points against the first model's."""
     shifts: dict[str, list[float]] = {name: [] for name in models}
     for index in indices if models else []:
-        answers = {name: model(dataset[index].partial)[0] for name, model in models.items()}
+        answers = {name: model.of(dataset[index]).fine_m for name, model in models.items()}
         reference = next(iter(answers.values()))
         for name, fine in answers.items():
             shifts[name].append(100 * float(np.sqrt(np.square(fine - reference).sum(axis=1).mean())))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoint to ONNX: the graph is built by hand, in metres, for any number of input points."""
+"""Network to ONNX: the graph is built by hand, in the unit of the input, for any number of points and objects."""
 
 from __future__ import annotations
 
@@ -8,159 +8,293 @@ from typing import Any
 
 import numpy as np
 import onnx
-import torch
-from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
 
-from train.network import COARSE_POINTS, FINE_POINTS, PATCH_CELLS, SCALE_M, patch_grid
+from edge.errors import ModelError
+from edge.frames import Float32
+from train.graph import Graph, per_object
+from train.network import CompletionModel, CompletionNetwork
+from train.networks.ours import OurNetwork, OurOptions
+from train.quantize import with_saturation_probe
 
-OPSET, IR_VERSION = 21, 10
-COORDINATE_NODES = ("point1", "distance", "fold_coarse", "fold3")
-"""Nodes that work on coordinates; they stay in float when the rest is quantized."""
-
-_Weights = dict[str, NDArray[np.float32]]
-
-
-class _Graph:
-    """Nodes and constants of a graph under construction; a node is named after its output."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def constant(self, name: str, value: NDArray[Any]) -> str:
-        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
-        return name
-
-    def add(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
-        return output
-
-    def linear(self, source: str, weight: NDArray[np.float32], bias: NDArray[np.float32] | str, output: str) -> str:
-        """``source @ weight.T + bias``; a bias that is a name is the output of a node [1, channels]."""
-        offset = bias if isinstance(bias, str) else self.constant(f"{output}.bias", bias)
-        return self.add("Gemm", [source, self.constant(f"{output}.weight", weight.T), offset], output)
-
-    def relu(self, source: str) -> str:
-        return self.add("Relu", [source], f"{source}_relu")
-
-    def view(self, source: str, shape: list[int], output: str) -> str:
-        return self.add("Reshape", [source, self.constant(f"{output}.shape", np.array(shape, np.int64))], output)
+INT8_NODES = ("local1", "local2", "fold1_cells", "fold2", "fold3", "sigma_log")
+"""Nodes that compute per input point or per fine point on features: nearly all of the time, and fit for eight bits.
+Coordinates, layers of one row and of one row per coarse point stay in float."""
 
 
-def build(weights: _Weights) -> onnx.ModelProto:
-    """The network of ``network.CompletionNetwork`` as an ONNX graph (opset 21).
+def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
+    """A network as an ONNX graph for one object (opset 21).
+
+    The graph computes in the unit of the input about its centre: scale and centring cost nothing. What does not differ
+    per fine point is computed once per coarse point or once per cloud, the product of the folding's local weight and
+    the encoder's last weight is a constant, and so is the patch term.
 
     Args:
-        weights: the network's state, float32.
+        network: ``paper``, ``pcn`` or ``ours`` of ``networks.registry``, with any options.
+        classifier: whether the graph gives classes; the paper's network has its classifier in training only.
     Returns:
-        Model with input ``points`` float32 [n, 3] metres, n >= 1 free, and outputs ``fine`` float32 [16384, 3] and
-        ``coarse`` float32 [1024, 3], metres, in the frame of the input, and ``class_probability`` float32 [classes].
-        What does not differ per fine point is computed once per coarse point or once per cloud, and the product of the
-        folding's local weight and the encoder's last weight is a constant.
+        Model with input ``points`` float32 [n, columns] metres, n >= 1 free, and outputs ``fine`` float32 [fine, 3] and
+        ``coarse`` float32 [coarse, 3], in unit and frame of the input; with a classifier ``class_probability`` float32
+        [classes]; with the option ``sigma`` float32 [fine], expected distance of a fine point to the surface.
+    Raises:
+        ModelError: a network of another kind.
     """
-    graph = _Graph()
-    classes = len(weights["class2.bias"])
-    center = _center(graph)
-    hidden, feature = _encoder(graph, weights)
-    coarse = _coarse(graph, weights, feature)
-    _folding(graph, weights, hidden, feature, coarse)
-    for name, rows in (("coarse", COARSE_POINTS), ("fine", FINE_POINTS)):
-        graph.add("Mul", [graph.view(f"{name}_unit", [rows, 3], f"{name}_rows"), "scale"], f"{name}_scaled")
-        graph.add("Add", [f"{name}_scaled", center], name)
-    graph.linear(feature, weights["class1.weight"], weights["class1.bias"], "class1")
-    logits = graph.linear(graph.relu("class1"), weights["class2.weight"], weights["class2.bias"], "class2")
-    graph.view(graph.add("Softmax", [logits], "softmax", axis=1), [classes], "class_probability")
-    value = helper.make_tensor_value_info
-    model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            "completion",
-            [value("points", TensorProto.FLOAT, ["points", 3])],
-            [
-                value("fine", TensorProto.FLOAT, [FINE_POINTS, 3]),
-                value("coarse", TensorProto.FLOAT, [COARSE_POINTS, 3]),
-                value("class_probability", TensorProto.FLOAT, [classes]),
-            ],
-            graph.constants,
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="rfconstruct",
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model
+    if not isinstance(network, CompletionNetwork):
+        raise ModelError(
+            "this network has no edge graph", value=type(network).__name__, allowed="paper, pcn, ours", action="choose"
+        )
+    return _Builder(network).model(classifier and network.classes > 0)
 
 
-def _center(graph: _Graph) -> str:
-    """Points in network units, x and y about the middle of their bounding box; returns that middle [1, 3], z 0."""
-    graph.constant("scale", np.array(SCALE_M, np.float32))
-    axis = graph.constant("rows", np.array([0], np.int64))
-    graph.add("ReduceMax", ["points", axis], "high", keepdims=1)
-    graph.add("ReduceMin", ["points", axis], "low", keepdims=1)
-    graph.add("Add", ["high", "low"], "both_ends")
-    graph.add("Mul", ["both_ends", graph.constant("half", np.array([[0.5, 0.5, 0.0]], np.float32))], "center")
-    graph.add("Sub", ["points", "center"], "centered")
-    graph.add("Div", ["centered", "scale"], "unit")
-    return "center"
-
-
-def _encoder(graph: _Graph, weights: _Weights) -> tuple[str, str]:
-    """Hidden rows of the second PointNet layer [n, channels] and the global feature [1, channels]."""
-    graph.linear("unit", weights["point1.weight"], weights["point1.bias"], "point1")
-    first = graph.linear(graph.relu("point1"), weights["point2.weight"], weights["point2.bias"], "point2")
-    graph.add("ReduceMax", [first, "rows"], "global1", keepdims=1)
-    weight = weights["local1.weight"]
-    split = weight.shape[1] // 2
-    shared = graph.linear("global1", weight[:, split:], weights["local1.bias"], "local1_global")
-    graph.linear(first, weight[:, :split], shared, "local1")
-    hidden = graph.relu("local1")
-    graph.linear(hidden, weights["local2.weight"], weights["local2.bias"], "local2")
-    return hidden, graph.add("ReduceMax", ["local2", "rows"], "feature", keepdims=1)
-
-
-def _coarse(graph: _Graph, weights: _Weights, feature: str) -> str:
-    """Coarse points [1024, 3] in network units."""
-    source = feature
-    for name in ("coarse1", "coarse2"):
-        graph.linear(source, weights[f"{name}.weight"], weights[f"{name}.bias"], name)
-        source = graph.relu(name)
-    graph.linear(source, weights["coarse3.weight"], weights["coarse3.bias"], "coarse3")
-    return graph.view("coarse3", [COARSE_POINTS, 3], "coarse_unit")
-
-
-def _folding(graph: _Graph, weights: _Weights, hidden: str, feature: str, coarse: str) -> str:
-    """Fine points [1024, 16, 3] in network units: nearest input point's local feature, then the folding."""
-    weight, channels = weights["fold1.weight"], weights["local2.weight"].shape[0]
-    of_local, of_global = weight[:, 5 : 5 + channels], weight[:, 5 + channels :]
-    graph.add("Mul", ["unit", "unit"], "unit_squared")
-    graph.add("ReduceSum", ["unit_squared", graph.constant("columns", np.array([1], np.int64))], "norm", keepdims=0)
-    graph.add("Gemm", [coarse, "unit", "norm"], "distance", transB=1, alpha=-2.0)
-    graph.add("ArgMin", ["distance"], "nearest", axis=1, keepdims=0)
-    local = graph.add("Gather", [hidden, "nearest"], "local", axis=0)
-    bias = weights["fold1.bias"] + of_local @ weights["local2.bias"]
-    shared = graph.linear(feature, of_global, bias, "fold_global")
-    base = graph.linear(coarse, weight[:, 2:5], shared, "fold_coarse")
-    width = weights["fold2.weight"].shape[0]
-    graph.linear(local, of_local @ weights["local2.weight"], base, "fold_local")
-    graph.view("fold_local", [COARSE_POINTS, 1, width], "fold_base")
-    patch = patch_grid().numpy() @ weight[:, :2].T
-    graph.add("Add", ["fold_base", graph.constant("fold_patch", patch[None])], "fold1_cells")
-    graph.view(graph.relu("fold1_cells"), [FINE_POINTS, width], "fold1")
-    graph.linear("fold1", weights["fold2.weight"], weights["fold2.bias"], "fold2")
-    graph.linear(graph.relu("fold2"), weights["fold3.weight"], weights["fold3.bias"], "fold3")
-    graph.view("fold3", [COARSE_POINTS, PATCH_CELLS, 3], "offset")
-    graph.view(coarse, [COARSE_POINTS, 1, 3], "coarse_cells")
-    return graph.add("Add", ["offset", "coarse_cells"], "fine_unit")
-
-
-def export(state: dict[str, torch.Tensor], path: Path) -> None:
-    """Write a network state as a fp32 ONNX file.
-
-    Args:
-        state: ``Checkpoint.average`` or a state dict.
-        path: the file.
-    """
-    weights = {name: value.detach().cpu().float().numpy() for name, value in state.items()}
+def export(model: onnx.ModelProto, path: Path) -> None:
+    """Write a model of one object, fp32 or quantized, as a file for any number of objects (``graph.per_object``)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    onnx.save(build(weights), path)
+    whole = per_object(model)
+    coded = any(node.op_type == "QGemm" for node in model.graph.node)
+    onnx.save(with_saturation_probe(whole) if coded else whole, path)
+
+
+class _Builder:
+    """The layers of one network; method by method what ``network`` and ``networks.ours`` compute."""
+
+    def __init__(self, network: CompletionNetwork) -> None:
+        self.network, self.graph, self.scale = network, Graph(), np.float32(network.scale)
+        self.options = network.options if isinstance(network, OurNetwork) else OurOptions(coarse=network.coarse_points)
+        self.weights = {name: value.detach().cpu().float().numpy() for name, value in network.state_dict().items()}
+        self.channels, self.width = network.width.local[1], network.width.fold
+        self.count, self.cells = network.coarse_points, network.cells
+
+    def model(self, classifier: bool) -> onnx.ModelProto:
+        """The whole graph."""
+        graph, fine = self.graph, self.count * self.cells
+        self._center()
+        hidden, feature = self._encoder(self._inputs())
+        graph.prepare_rows("centered")
+        if self.options.attention in ("tokens", "both"):
+            feature = graph.add("Add", [feature, self._probe(hidden, feature)], "feature_probed")
+        coarse, base = self._folding_base(hidden, feature)
+        graph.add("Add", [coarse, "center"], "coarse")
+        last = self._folding(base)
+        outputs: dict[str, tuple[int, ...]] = {"fine": (fine, 3), "coarse": (self.count, 3)}
+        if classifier:
+            graph.relu(self._layer("class1", feature))
+            graph.add("Softmax", [self._layer("class2", "class1_relu")], "softmax", axis=1)
+            graph.view("softmax", [self.network.classes], "class_probability")
+            outputs["class_probability"] = (self.network.classes,)
+        if self.options.uncertainty:
+            bias = self.weights["sigma.bias"] + np.log(self.scale)
+            graph.add("Exp", [graph.linear(last, self.weights["sigma.weight"], bias, "sigma_log")], "sigma_column")
+            graph.view("sigma_column", [fine], "sigma")
+            outputs["sigma"] = (fine,)
+        return graph.model(outputs, self.network.columns)
+
+    def _layer(self, name: str, source: str) -> str:
+        return self.graph.linear(source, self.weights[f"{name}.weight"], self.weights.get(f"{name}.bias"), name)
+
+    def _center(self) -> None:
+        """Points about their centre, "centered" [n, 3]; the centre is 0 in the box, in sight the middle in x and y."""
+        graph, sight = self.graph, self.network.frame == "sight"
+        places = "points"
+        if self.network.columns > 3:
+            places = graph.add("Slice", ["points", *(graph.integers(n) for n in (0, 3, 1))], "places")
+        graph.add("ReduceMax", [places, graph.integers(0)], "high", keepdims=1)
+        graph.add("ReduceMin", [places, graph.integers(0)], "low", keepdims=1)
+        graph.add("Add", ["high", "low"], "both_ends")
+        half = np.array([[0.5, 0.5, 0.0]], np.float32) * sight
+        graph.add("Mul", ["both_ends", graph.constant("half", half)], "center")
+        graph.add("Sub", [places, "center"], "centered")
+
+    def _inputs(self) -> str:
+        """Coordinates and what the options add, scaled in the first layer's weight."""
+        from train.networks.ours import GROUND_M, GROUND_WIDTH_M
+
+        graph, columns = self.graph, ["centered"]
+        if self.options.power:
+            columns.append(graph.add("Slice", ["points", *(graph.integers(n) for n in (3, 4, 1))], "power_db"))
+        if self.options.ground:
+            height = graph.add("Slice", ["centered", *(graph.integers(n) for n in (2, 3, 1))], "height")
+            factor = np.full((1, 1), -1 / GROUND_WIDTH_M, np.float32)
+            graph.linear(height, factor, np.full(1, GROUND_M / GROUND_WIDTH_M, np.float32), "nearness")
+            columns.append(graph.add("Sigmoid", ["nearness"], "ground"))
+        return graph.add("Concat", columns, "inputs", axis=1) if len(columns) > 1 else columns[0]
+
+    def _encoder(self, source: str) -> tuple[str, str]:
+        """Hidden rows of the second PointNet layer [n, channels] and the global feature [1, channels]."""
+        from train.networks.ours import POWER_DB
+
+        graph, weights = self.graph, self.weights
+        lift = weights["point1.weight"] / np.array([self.scale] * 3 + [1.0] * (weights["point1.weight"].shape[1] - 3))
+        if self.options.power:
+            lift[:, 3] /= POWER_DB
+        graph.relu(graph.linear(source, lift.astype(np.float32), weights["point1.bias"], "point1"))
+        first = self._layer("point2", "point1_relu")
+        graph.add("ReduceMax", [first, graph.integers(0)], "global1", keepdims=1)
+        weight = weights["local1.weight"]
+        split = weight.shape[1] // 2
+        shared = graph.linear("global1", weight[:, split:], weights["local1.bias"], "local1_global")
+        hidden = graph.relu(graph.linear(first, weight[:, :split], shared, "local1"))
+        self._layer("local2", hidden)
+        return hidden, graph.add("ReduceMax", ["local2", graph.integers(0)], "feature", keepdims=1)
+
+    def _folding_base(self, hidden: str, feature: str) -> tuple[str, str]:
+        """Coarse points about the centre, and what all cells of a coarse point share in the folding [coarse, fold]."""
+        graph, weights = self.graph, self.weights
+        weight, local = weights["fold1.weight"], self.network.local
+        coarse, bias = self._coarse(feature), weights["fold1.bias"]
+        of_coarse = weight[:, 2:5] / self.scale
+        if not local:
+            shared = graph.linear(feature, weight[:, -self.channels :], bias, "fold_global")
+            return coarse, graph.linear(coarse, of_coarse, shared, "fold_coarse")
+        of_local = weight[:, 5 : 5 + self.channels]
+        bias = bias + of_local @ weights["local2.bias"]
+        shared = graph.linear(feature, weight[:, -self.channels :], bias, "fold_global")
+        rows = graph.nearest_rows(coarse, self.count, "nearest")
+        found = graph.add("Gather", [hidden, rows], "local", axis=0)
+        product = of_local @ weights["local2.weight"]
+        extra = []
+        if self.options.attention in ("coarse", "both"):
+            own = graph.linear(found, product, None, "fold_local")
+            context = self._look(coarse, own)
+            moved = graph.linear(context, weights["coarse_move.weight"] * self.scale,
+                                 weights["coarse_move.bias"] * self.scale, "coarse_step")  # fmt: skip
+            coarse = graph.add("Add", [coarse, moved], "coarse_moved")
+            base = graph.linear(coarse, of_coarse, shared, "fold_coarse")
+            extra = [own, context]
+        else:
+            base = graph.linear(coarse, of_coarse, shared, "fold_coarse")
+            base = graph.linear(found, product, base, "fold_local")
+        if self.options.mirror == "cue":
+            extra += self._cue(coarse, hidden, rows, feature)
+        for number, term in enumerate(extra):
+            base = graph.add("Add", [base, term], f"fold_sum{number}")
+        return coarse, base
+
+    def _coarse(self, feature: str) -> str:
+        """Coarse points [coarse, 3] about the centre."""
+        graph, weights = self.graph, self.weights
+        source = feature
+        for name in ("coarse1", "coarse2"):
+            source = graph.relu(self._layer(name, source))
+        weight, bias = weights["coarse3.weight"] * self.scale, weights["coarse3.bias"] * self.scale
+        return graph.view(graph.linear(source, weight, bias, "coarse3"), [self.count, 3], "coarse_centered")
+
+    def _folding(self, base: str) -> str:
+        """Fine points [fine, 3]; returns the last hidden layer."""
+        graph, weights = self.graph, self.weights
+        graph.view(base, [self.count, 1, self.width], "fold_base")
+        patch = self.network.patch.numpy() @ weights["fold1.weight"][:, :2].T
+        graph.add("Add", ["fold_base", graph.constant("fold_patch", patch[None])], "fold1_cells")
+        graph.view(graph.relu("fold1_cells"), [self.count * self.cells, self.width], "fold1")
+        last = graph.relu(self._layer("fold2", "fold1"))
+        graph.linear(last, weights["fold3.weight"] * self.scale, weights["fold3.bias"] * self.scale, "fold3")
+        graph.view("fold3", [self.count, self.cells, 3], "offset")
+        graph.view("coarse", [self.count, 1, 3], "coarse_cells")
+        graph.add("Add", ["offset", "coarse_cells"], "fine_cells")
+        graph.view("fine_cells", [self.count * self.cells, 3], "fine")
+        return last
+
+    def _probe(self, hidden: str, feature: str) -> str:
+        """``OurNetwork._probe``: addition to the global feature [1, channels]."""
+        graph, weights = self.graph, self.weights
+        anchors = self.network.anchors.numpy()  # type: ignore[operator]
+        graph.add("Sub", ["low", "center"], "low_centered")
+        graph.add("Sub", ["high", "low"], "extent")
+        graph.add("Mul", ["extent", graph.constant("anchors", anchors)], "anchors_scaled")
+        places = graph.add("Add", ["low_centered", "anchors_scaled"], "anchor_places")
+        rows = graph.nearest_rows(places, len(anchors), "anchor_rows")
+        found = graph.add("Gather", ["centered", rows], "anchor_points", axis=0)
+        graph.add("Sub", [found, places], "anchor_away")
+        where = graph.add("Concat", [found, "anchor_away"], "anchor_where", axis=1)
+        place = graph.linear(where, weights["token_place.weight"] / self.scale, None, "token_place")
+        own = self._layer("token_hidden", graph.add("Gather", [hidden, rows], "anchor_hidden", axis=0))
+        shared = self._layer("token_global", feature)
+        tokens = graph.add("Add", [own, graph.add("Add", [place, shared], "token_shared")], "tokens")
+        for number in range(len(self.network.token_blocks)):  # type: ignore[arg-type]
+            tokens = self._block(f"token_blocks.{number}", tokens, len(anchors))
+        graph.add("ReduceMax", [tokens, graph.integers(0)], "tokens_high", keepdims=1)
+        return self._layer("token_out", "tokens_high")
+
+    def _look(self, coarse: str, own: str) -> str:
+        """``OurNetwork._look``: context of every coarse point [coarse, fold]."""
+        from train.networks.ours import LANDMARKS
+
+        graph = self.graph
+        weight, bias = self.weights["coarse_in.weight"] / self.scale, self.weights["coarse_in.bias"]
+        tokens = graph.add("Add", [graph.linear(coarse, weight, bias, "coarse_in"), own], "coarse_tokens")
+        step = self.count // LANDMARKS
+        marks = [graph.integers(0), graph.integers(self.count), graph.integers(0), graph.integers(step)]
+        return self._block("coarse_block", tokens, self.count, graph.add("Slice", [tokens, *marks], "landmarks"))
+
+    def _block(self, name: str, tokens: str, count: int, memory: str = "") -> str:
+        """A transformer block (``networks.attention.Block``) over [count, channels]."""
+        block: Any = self.network.get_submodule(name)
+        graph, heads = self.graph, int(block.attention.heads)
+        normal = self._norm(f"{name}.before", tokens, f"{name}.normal")
+        seen = self._norm(f"{name}.before", memory, f"{name}.seen") if memory else normal
+        depth = self.width // heads
+        key_value = self.weights[f"{name}.attention.key_value.weight"]
+        query = self.weights[f"{name}.attention.query.weight"] / np.sqrt(np.float32(depth))
+        parts = {}
+        for part, source, weight, order in (
+            ("query", normal, query, [1, 0, 2]),
+            ("key", seen, key_value[: self.width], [1, 2, 0]),
+            ("value", seen, key_value[self.width :], [1, 0, 2]),
+        ):
+            flat = graph.linear(source, weight, None, f"{name}.{part}")
+            split = graph.view(flat, [-1, heads, depth], f"{name}.{part}_heads")
+            parts[part] = graph.add("Transpose", [split], f"{name}.{part}_turned", perm=order)
+        score = graph.add("MatMul", [parts["query"], parts["key"]], f"{name}.score")
+        share = graph.add("Softmax", [score], f"{name}.share", axis=-1)
+        mixed = graph.add("MatMul", [share, parts["value"]], f"{name}.mixed")
+        turned = graph.add("Transpose", [mixed], f"{name}.mixed_turned", perm=[1, 0, 2])
+        flat = graph.view(turned, [count, self.width], f"{name}.mixed_flat")
+        attended = graph.add("Add", [tokens, self._layer(f"{name}.attention.output", flat)], f"{name}.attended")
+        middle = self._norm(f"{name}.middle", attended, f"{name}.middle_normal")
+        curved = graph.add("Gelu", [self._layer(f"{name}.mlp.0", middle)], f"{name}.curved")
+        return graph.add("Add", [attended, self._layer(f"{name}.mlp.2", curved)], f"{name}.out")
+
+    def _norm(self, layer: str, source: str, output: str) -> str:
+        names = [self.graph.constant(f"{layer}.{part}", self.weights[f"{layer}.{part}"]) for part in ("weight", "bias")]
+        return self.graph.add("LayerNormalization", [source, *names], output, axis=-1, epsilon=1e-5)
+
+    def _cue(self, coarse: str, hidden: str, rows: str, feature: str) -> list[str]:
+        """``OurNetwork._cue``: two terms of the folding's first layer."""
+        graph, weights = self.graph, self.weights
+        weight, bias = weights["plane.weight"].copy(), weights["plane.bias"].copy()
+        weight[2], bias[2] = weight[2] * self.scale, bias[2] * self.scale
+        graph.linear(feature, weight, bias, "plane")
+        raw = graph.add("Slice", ["plane", *(graph.integers(n) for n in (0, 2, 1))], "plane_raw")
+        length = graph.add("ReduceL2", [raw, graph.integers(1)], "plane_length", keepdims=1)
+        graph.add("Max", [length, graph.constant("least", np.full(1, 1e-12, np.float32))], "plane_divisor")
+        graph.add("Div", [raw, "plane_divisor"], "plane_unit")
+        zero = graph.constant("zero_column", np.zeros((1, 1), np.float32))
+        graph.add("Concat", ["plane_unit", zero], "plane_normal", axis=1)
+        graph.add("Slice", ["plane", *(graph.integers(n) for n in (2, 3, 1))], "plane_offset")
+        other = graph.nearest_rows(self._mirrored(coarse, "image"), self.count, "mirror_rows")
+        here = graph.add("Gather", ["centered", rows], "nearest_points", axis=0)
+        there = self._mirrored(graph.add("Gather", ["centered", other], "mirror_points", axis=0), "back")
+        evidence = [graph.add("Sub", [one, coarse], f"evidence{n}") for n, one in enumerate((here, there))]
+        both = graph.add("Concat", evidence, "evidence", axis=1)
+        of_mirror = graph.add("Gather", [hidden, other], "mirror_hidden", axis=0)
+        return [
+            self._layer("of_mirror", of_mirror),
+            graph.linear(both, weights["of_evidence.weight"] / self.scale, None, "of_evidence"),
+        ]
+
+    def _mirrored(self, points: str, output: str) -> str:
+        """Mirror image about the plane; [n, 3]."""
+        graph = self.graph
+        graph.add("Gemm", [points, "plane_normal"], f"{output}_along", transB=1)
+        graph.add("Sub", [f"{output}_along", "plane_offset"], f"{output}_distance")
+        two = graph.constant("two", np.array(2, np.float32))
+        twice = graph.add("Mul", [f"{output}_distance", two], f"{output}_two")
+        return graph.add("Sub", [points, graph.add("Mul", [twice, "plane_normal"], f"{output}_step")], output)
+
+
+def example_input(network: CompletionModel, points: int = 64) -> Float32:
+    """A cloud of the network's columns, for checks: float32 [points, columns]."""
+    rng = np.random.default_rng(points)
+    cloud = rng.normal(size=(points, network.columns)) * 0.2
+    cloud[:, :3] += (0.0, 0.0, 0.2)
+    if network.frame == "sight":
+        cloud[:, :3] = cloud[:, :3] * network.scale + (8, -3, 0)
+    return cloud.astype(np.float32)

@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from edge.completion.manifest import InputFrame
+from edge.completion.confidence import ConfidenceModel
+from edge.completion.manifest import SCHEMA, InputFrame
 from edge.frames import Float32
-from train.dataset import CLASSES
 from train.evaluate import OnnxModel
-from train.network import COARSE_POINTS, FINE_POINTS
+from train.network import CompletionModel
 
-SCHEMA = 1
 FULL, SMALL = "model.onnx", "model.int8.onnx"
-FRAME: InputFrame = "line_of_sight"
+FRAMES: dict[str, InputFrame] = {"sight": "line_of_sight", "box": "box"}
+"""A network's frame -> the manifest's."""
+MIN_POINTS, MAX_POINTS = 64, 2048
+"""Of an input cloud, as the data sets draw them."""
 _FINE_ROWS = 1024
 _JITTER_M = 1e-5
 _LEAST_TOLERANCE_M = {FULL: 1e-3, SMALL: 1e-2}
@@ -50,7 +52,8 @@ def write_golden(path: Path, models: dict[str, OnnxModel], inputs: Sequence[Floa
         found = {name: _sensitivity(model, points, rng) for name, model in models.items()}
         if sum(found.values()) < sum(change.values()):
             best, change = points, found
-    rows = np.sort(rng.choice(FINE_POINTS, _FINE_ROWS, replace=False))
+    count = min(len(model(best)[0]) for model in models.values())
+    rows = np.sort(rng.choice(count, min(count, _FINE_ROWS), replace=False))
     content: dict[str, Any] = {"points": best, "fine_rows": rows}
     for name, model in models.items():
         fine, coarse, probability = model(best)
@@ -73,8 +76,11 @@ def write_manifest(
     folder: Path,
     name: str,
     default_file: str,
+    network: CompletionModel,
+    classes: Sequence[str],
     rigs: Sequence[str],
     tolerance_m: dict[str, float],
+    confidence: ConfidenceModel | None,
     training: dict[str, Any],
 ) -> None:
     """Write manifest.json beside the model files.
@@ -83,8 +89,11 @@ def write_manifest(
         folder: model folder with both model files and golden.npz.
         name: of the model.
         default_file: file that the runtime takes.
+        network: that was exported: its frame and sizes.
+        classes: that the graph gives; none: no classifier.
         rigs: rigs whose clouds the training data are like.
         tolerance_m: of ``write_golden``.
+        confidence: calibrated; None: not yet.
         training: where the weights come from, and what was measured.
     """
     files = []
@@ -98,11 +107,17 @@ def write_manifest(
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": files,
         "default_file": default_file,
-        "classes": list(CLASSES),
-        "input": {"min_points": 64, "max_points": 2048, "frame": FRAME},
-        "output": {"coarse": COARSE_POINTS, "fine": FINE_POINTS},
+        "classes": list(classes),
+        "input": {
+            "min_points": MIN_POINTS,
+            "max_points": MAX_POINTS,
+            "columns": network.columns,
+            "frame": FRAMES[network.frame],
+        },
+        "output": {"coarse": network.coarse_points, "fine": network.coarse_points * network.cells},
         "rigs": list(rigs),
         "golden": {"file": "golden.npz", "tolerance_m": tolerance_m},
+        "confidence": None if confidence is None else confidence.to_dict(),
         "training": training,
     }
     (folder / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")

@@ -195,6 +195,8 @@ def model() -> Check:
 
     settings = CompletionSettings()
     loaded = CompletionModel.load(find_model(settings.model), settings)
+    if loaded.fallback:
+        return Check("model", "note", f"{loaded.manifest.name}: {loaded.file} runs, slower; {loaded.fallback}")
     return Check("model", "ok", f"{loaded.manifest.name}, {loaded.file}: gives its known answer")
 
 

@@ -11,13 +11,15 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, get_args
 
+from edge.completion.confidence import ConfidenceModel
 from edge.errors import ModelError
 from edge.resources import shipped_dir
 
-SCHEMA = 1
-InputFrame = Literal["object", "line_of_sight"]
+SCHEMA = 2
+InputFrame = Literal["object", "line_of_sight", "box"]
 INPUT_FRAMES: tuple[InputFrame, ...] = get_args(InputFrame)
 FILE_LIMIT_BYTES = 256 * 2**20
 """Larger files are refused before they are read."""
@@ -34,10 +36,11 @@ _KEYS: dict[str, dict[str, type | tuple[type, ...]]] = {
         "output": dict,
         "rigs": list,
         "golden": dict,
+        "confidence": (dict, NoneType),
         "training": dict,
     },
     "files": {"file": str, "sha256": str, "precision": str, "bytes": int},
-    "input": {"min_points": int, "max_points": int, "frame": str},
+    "input": {"min_points": int, "max_points": int, "columns": int, "frame": str},
     "output": {"coarse": int, "fine": int},
     "golden": {"file": str, "tolerance_m": dict},
 }
@@ -68,13 +71,16 @@ class Manifest:
         name: of the model.
         files: ONNX files, by name.
         default_file: the one that is run.
-        classes: names in the order of the network's probabilities.
+        classes: names in the order of the network's probabilities; none: it has no classifier.
         min_points, max_points: input sizes the network was trained on.
-        input_frame: frame of its input and output: the object's, or that of ``edge.completion.sight``.
+        columns: of an input point: x, y, z in metres, and power in dB about the cloud's median if there are four.
+        input_frame: frame of its input and output: that of ``edge.completion.sight``, the object frame as the tracker
+            gives it, or the object's own box (centre and heading known, lengths in its diagonals).
         coarse_points, fine_points: sizes of the two output clouds.
         rigs: rigs whose clouds the training data are like.
         golden_file: file with the known answers.
         tolerance_m: file name -> largest coordinate difference from the known answer.
+        confidence: calibrated confidence and the threshold of "unknown"; None: not calibrated.
     """
 
     name: str
@@ -83,12 +89,14 @@ class Manifest:
     classes: tuple[str, ...]
     min_points: int
     max_points: int
+    columns: int
     input_frame: InputFrame
     coarse_points: int
     fine_points: int
     rigs: tuple[str, ...]
     golden_file: str
     tolerance_m: dict[str, float]
+    confidence: ConfidenceModel | None = None
 
 
 def find_model(model: str) -> Path:
@@ -141,12 +149,14 @@ def read_manifest(directory: Path) -> Manifest:
         classes=tuple(top["classes"]),
         min_points=sizes["min_points"],
         max_points=sizes["max_points"],
+        columns=sizes["columns"],
         input_frame=sizes["frame"],
         coarse_points=output["coarse"],
         fine_points=output["fine"],
         rigs=tuple(top["rigs"]),
         golden_file=golden["file"],
         tolerance_m=golden["tolerance_m"],
+        confidence=None if top["confidence"] is None else ConfidenceModel.from_dict(top["confidence"]),
     )
     if len(manifest.files) != len(entries):
         raise _refused(path, "files.file", [entry["file"] for entry in entries], "different names")
@@ -230,12 +240,13 @@ def _check(path: Path, manifest: Manifest) -> None:
             "lower-case names that can stand in a topic",
         ),
         (
-            len(set(map(str, manifest.classes))) == len(manifest.classes) > 0,
+            len(set(map(str, manifest.classes))) == len(manifest.classes),
             "classes",
             manifest.classes,
             "different names",
         ),
         (manifest.input_frame in INPUT_FRAMES, "input.frame", manifest.input_frame, ", ".join(INPUT_FRAMES)),
+        (manifest.columns in (3, 4), "input.columns", manifest.columns, "3 or 4"),
         (min(sizes) > 0 and sizes[0] <= sizes[1], "input and output", sizes, "positive, min_points <= max_points"),
         (
             tolerances.keys() == manifest.files.keys()

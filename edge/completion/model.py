@@ -2,20 +2,25 @@
 """Shape completion with ONNX Runtime on the CPU: a partial cloud in, a completed shape out.
 
 A model that is loaded has given its known answer in this process, on this processor: of altered ONNX files a good third
-load without complaint and compute something else, so neither the hash nor the runtime alone is trusted.
+load without complaint and compute something else, so neither the hash nor the runtime alone is trusted. An int8 file
+that fails here, as on a processor whose eight-bit products saturate, is replaced by the folder's fp32 file.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import onnxruntime
+from numpy.typing import NDArray
 
+from edge.completion.confidence import measures
+from edge.completion.golden import PROBE, check_golden
 from edge.completion.manifest import Manifest, read_files, read_manifest
+from edge.completion.network import Answer, Network
 from edge.completion.sight import bearing_rad, turned
 from edge.config import CompletionSettings
 from edge.errors import ConfigError, ModelError
@@ -29,10 +34,10 @@ ENOUGH_POINTS = 256
 768 points were completed to a mean Chamfer distance of 8.7, 8.2, 7.2 and 7.5 cm."""
 CUT_WINDOW_FACTOR = 0.8
 """Confidence of a window that time, a pose gap or the end of the data cut, against a whole one."""
-PROBABILITY_TOLERANCE = 0.02
-"""Largest difference of a class probability from its known answer."""
+FARTHEST_M = 1000.0
+"""Coordinates beyond it are no object frame's; the graph's search reckons with less than 10 km."""
 _THINNING_SEED = 0
-_OUTPUTS = ["fine", "coarse", "class_probability"]
+_LOG = logging.getLogger(__name__)
 
 
 class CompletionModel:
@@ -41,16 +46,17 @@ class CompletionModel:
     Args:
         manifest: of the folder.
         file: name of the ONNX file that runs.
-        session: the loaded file.
+        network: the loaded file.
         settings: limits and threads.
+        fallback: why the default file does not run; "": it does, or another was asked for.
     """
 
     def __init__(
-        self, manifest: Manifest, file: str, session: onnxruntime.InferenceSession, settings: CompletionSettings
+        self, manifest: Manifest, file: str, network: Network, settings: CompletionSettings, fallback: str = ""
     ) -> None:
-        self.manifest, self.file, self.settings = manifest, file, settings
+        self.manifest, self.file, self.settings, self.fallback = manifest, file, settings, fallback
         self.identifier = manifest.files[file].sha256[:16]
-        self._session = session
+        self._network = network
 
     @classmethod
     def load(
@@ -62,11 +68,13 @@ class CompletionModel:
     ) -> CompletionModel:
         """Load a model folder: manifest, hashes of all files, session, known answer.
 
+        When the default file is int8 and fails, the fp32 file is taken; ``fallback`` and the log tell why.
+
         Args:
             directory: model folder (``find_model(settings.model)``).
             settings: limits and threads.
             rig_name: rig whose clouds will be completed; None: not checked.
-            file: ONNX file to run; None: the manifest's default.
+            file: ONNX file to run, and no other; None: the manifest's default.
         Returns:
             The model, ready; its first shape takes no longer than the next.
         Raises:
@@ -80,10 +88,22 @@ class CompletionModel:
         name = manifest.default_file if file is None else file
         if name not in contents:
             raise ModelError(f"{directory}: no such model file", value=name, allowed=", ".join(contents))
-        session = _session(directory / name, contents[name], settings)
-        model = cls(manifest, name, session, settings)
-        model._check_graph(directory / name)
-        model._check_golden(directory)
+        candidates = [name]
+        if file is None and manifest.files[name].precision != "fp32":
+            candidates += [entry.file for entry in manifest.files.values() if entry.precision == "fp32"]
+        fallback = ""
+        for name in candidates:
+            try:
+                network = Network(contents[name], str(directory / name), settings.intra_op_threads)
+                _check_graph(directory / name, manifest, network)
+                check_golden(directory, manifest, name, network)
+                break
+            except ModelError as error:
+                if name == candidates[-1]:
+                    raise
+                fallback = str(error)
+                _LOG.warning("model %s: %s runs instead of its default: %s", manifest.name, candidates[-1], fallback)
+        model = cls(manifest, name, network, settings, fallback)
         if rig_name is not None and not model.valid_for(rig_name):
             raise ModelError(
                 f"model {manifest.name} is not made for rig {rig_name}",
@@ -106,99 +126,88 @@ class CompletionModel:
             cloud: partial cloud in the object frame; a model of the line-of-sight frame also needs ``sensor_m``.
         Returns:
             The shape in the object frame, or None when the cloud has fewer than ``min_points`` points. Its confidence
-            is that of ``confidence``; below ``min_confidence`` the class is "unknown".
+            is the calibrated one of the manifest (``edge.completion.confidence``), or that of ``confidence``. The class
+            is "unknown" below ``min_confidence``, below the manifest's threshold, and without a classifier.
         Raises:
-            ModelError: input or output is not finite, or there is no line of sight; the shape is withheld.
+            ModelError: input or output is not finite, the input is a kilometre away, or there is no line of sight; the
+                shape is withheld.
         """
         if len(cloud) < self.settings.min_points:
             return None
         started_ns = time.perf_counter_ns()
-        if not np.isfinite(cloud.xyz_m).all():
-            raise ModelError(f"object {cloud.identity}: its points are not finite, the shape is withheld")
-        points = _thinned(np.ascontiguousarray(cloud.xyz_m, np.float32), self.settings.max_points)
+        if not (np.abs(cloud.xyz_m) < FARTHEST_M).all():
+            raise ModelError(
+                f"object {cloud.identity}: its points are not finite and within {FARTHEST_M:g} m, the shape is withheld"
+            )
         bearing = self._bearing_rad(cloud)
-        fine, coarse, probability = self.run(turned(points, -bearing))
-        if not (np.isfinite(fine).all() and np.isfinite(coarse).all() and np.isfinite(probability).all()):
+        points = self._input(cloud, bearing)
+        answer = self.run(points)
+        if not answer.is_finite:
             raise ModelError(
                 f"object {cloud.identity}: the network's answer is not finite, the shape is withheld",
                 value=f"{len(points)} points, coordinates up to {float(np.abs(points).max()):.3g} m",
             )
-        best = int(np.argmax(probability))
-        trust = confidence(float(probability[best]), len(points), cloud)
-        probabilities = dict(zip(self.manifest.classes, probability.tolist(), strict=True))
-        probabilities.setdefault(UNKNOWN, 0.0)
+        trust, class_name = self._judged(cloud, points, answer)
+        probabilities = dict(zip(self.manifest.classes, answer.probability.tolist(), strict=True))
+        probabilities.setdefault(UNKNOWN, 0.0 if probabilities else 1.0)
         return Shape(
             identity=cloud.identity,
-            class_name=self.manifest.classes[best] if trust >= self.settings.min_confidence else UNKNOWN,
+            class_name=class_name,
             class_probability=probabilities,
             confidence=trust,
-            fine_m=turned(fine, bearing),
-            coarse_m=turned(coarse, bearing),
+            fine_m=turned(answer.fine_m, bearing),
+            coarse_m=turned(answer.coarse_m, bearing),
             input=cloud,
             model=self.identifier,
             latency_us={STAGE: (time.perf_counter_ns() - started_ns) // 1000},
             seen_points=len(points),
         )
 
-    def run(self, points_m: Float32) -> tuple[Float32, Float32, Float32]:
-        """The bare network.
+    def run(self, points: Float32) -> Answer:
+        """The bare network, for one cloud float32 [n, columns] in the manifest's input frame; see ``Network.run``."""
+        return self._network.run(points)
 
-        Args:
-            points_m: float32 [n, 3] in the manifest's input frame.
-        Returns:
-            Fine points float32 [16384, 3], coarse points float32 [1024, 3], metres in the frame of the input, and class
-            probabilities float32 [classes].
-        Raises:
-            ModelError: ONNX Runtime failed.
-        """
-        try:
-            fine, coarse, probability = self._session.run(_OUTPUTS, {"points": points_m})
-        except Exception as error:  # ONNX Runtime's own classes have no common root
-            raise ModelError(
-                f"model {self.manifest.name}: {self.file} failed ({type(error).__name__})", value=points_m.shape
-            ) from error
-        return fine, coarse, probability
+    def run_all(self, points: Float32, counts: Sequence[int]) -> Answer:
+        """The bare network, for many clouds; see ``Network.run_all``."""
+        return self._network.run_all(points, counts)
+
+    def _input(self, cloud: ObjectCloud, bearing: float) -> Float32:
+        """What the network sees: at most ``max_points`` rows, turned into its frame, with power where it wants it."""
+        points = np.ascontiguousarray(cloud.xyz_m, np.float32)
+        rows = _thinned(len(points), self.settings.max_points)
+        points = points if rows is None else points[rows]
+        points = turned(points, -bearing)
+        if self.manifest.columns == len("xyz"):
+            return points
+        power_db = cloud.power_db if rows is None else cloud.power_db[rows]
+        return np.column_stack([points, power_db - np.median(power_db)]).astype(np.float32)
+
+    def _judged(self, cloud: ObjectCloud, points: Float32, answer: Answer) -> tuple[float, str]:
+        """Confidence and class: calibrated when the manifest says how."""
+        most = float(answer.probability.max(initial=0.0))
+        best = self.manifest.classes[int(answer.probability.argmax())] if answer.probability.size else UNKNOWN
+        calibrated = self.manifest.confidence
+        if calibrated is None:
+            likely = most if answer.probability.size else 1.0
+            trust = confidence(likely, len(points), cloud)
+            return trust, best if trust >= self.settings.min_confidence else UNKNOWN
+        sigma_m = None if answer.sigma_m is None else float(answer.sigma_m.mean())
+        seen = measures(points[:, :3], answer.fine_m, answer.probability, cloud.frames, sigma_m)
+        judged = calibrated.trust(seen)
+        unknown = calibrated.is_unknown(judged) or judged.class_right < self.settings.min_confidence
+        return judged.shape, UNKNOWN if unknown else best
 
     def _bearing_rad(self, cloud: ObjectCloud) -> float:
         """Angle of the network's input frame in the object frame."""
+        if self.manifest.input_frame == "box":
+            raise ModelError(
+                f"object {cloud.identity}: the model completes in the object's own box, and no box is known",
+                value=self.manifest.name,
+                action="choose a model of the line of sight (completion.model)",
+            )
         if self.manifest.input_frame == "object":
             return 0.0
         return bearing_rad(f"object {cloud.identity}", cloud.sensor_m, cloud.xyz_m)
-
-    def _check_graph(self, path: Path) -> None:
-        """Inputs and outputs by name, type and shape; a dimension the graph leaves open is any number."""
-        manifest = self.manifest
-        promised = {
-            "points": [None, 3],
-            "fine": [manifest.fine_points, 3],
-            "coarse": [manifest.coarse_points, 3],
-            "class_probability": [len(manifest.classes)],
-        }
-        nodes = [*self._session.get_inputs(), *self._session.get_outputs()]
-        found = {n.name: [d if isinstance(d, int) else None for d in n.shape] for n in nodes}
-        if found != promised or any(node.type != "tensor(float)" for node in nodes):
-            raise ModelError(f"{path}: another graph than the manifest promises", value=found, allowed=str(promised))
-
-    def _check_golden(self, directory: Path) -> None:
-        """Run the known input and compare with the known answer."""
-        path = directory / self.manifest.golden_file
-        golden = _read_golden(path, self.file, self.manifest)
-        fine, coarse, probability = self.run(golden["points"])
-        allowed_m = self.manifest.tolerance_m[self.file]
-        checks = (
-            ("fine", fine[golden["fine_rows"]], allowed_m, "m"),
-            ("coarse", coarse, allowed_m, "m"),
-            ("class_probability", probability, PROBABILITY_TOLERANCE, ""),
-        )
-        for name, answer, allowed, unit in checks:
-            measured = float(np.abs(answer - golden[name]).max())
-            if not measured <= allowed:
-                raise ModelError(
-                    f"{directory / self.file}: {name} of the known input differs from its known answer",
-                    value=f"{measured:.3g} {unit}".strip(),
-                    allowed=f"at most {allowed:.3g} {unit}".strip(),
-                    action="altered weights, or a processor that rounds otherwise: install again or use the fp32 file",
-                )
 
 
 def confidence(class_probability: float, points: int, cloud: ObjectCloud) -> float:
@@ -221,13 +230,31 @@ def confidence(class_probability: float, points: int, cloud: ObjectCloud) -> flo
     return min(1.0, max(0.0, class_probability * enough * window * whole))
 
 
-def _thinned(points: Float32, most: int) -> Float32:
-    """At most ``most`` different rows, in their order; a function of the cloud alone."""
-    if len(points) <= most:
-        return points
-    rows = np.random.default_rng(_THINNING_SEED).choice(len(points), most, replace=False)
+def _thinned(count: int, most: int) -> NDArray[np.int64] | None:
+    """At most ``most`` different rows of ``count``, in their order, a function of the count alone; None: all."""
+    if count <= most:
+        return None
+    rows = np.random.default_rng(_THINNING_SEED).choice(count, most, replace=False)
     rows.sort()
-    return points[rows]
+    return rows
+
+
+def _check_graph(path: Path, manifest: Manifest, network: Network) -> None:
+    """Inputs and outputs by name, type and shape; a dimension the graph leaves open is any number."""
+    real, whole = "tensor(float)", "tensor(int64)"
+    promised: dict[str, tuple[str, list[int | None]]] = {
+        "points": (real, [None, manifest.columns]),
+        "counts": (whole, [None]),
+        "fine": (real, [None, manifest.fine_points, 3]),
+        "coarse": (real, [None, manifest.coarse_points, 3]),
+    }
+    if manifest.classes:
+        promised["class_probability"] = (real, [None, len(manifest.classes)])
+    found = {name: value for name, value in network.signature.items() if name != PROBE}
+    if "sigma" in found:
+        promised["sigma"] = (real, [None, manifest.fine_points])
+    if found != promised:
+        raise ModelError(f"{path}: another graph than the manifest promises", value=found, allowed=str(promised))
 
 
 def _check_limits(manifest: Manifest, settings: CompletionSettings) -> None:
@@ -239,44 +266,3 @@ def _check_limits(manifest: Manifest, settings: CompletionSettings) -> None:
                 value=value,
                 allowed=f"{manifest.min_points}..{manifest.max_points}",
             )
-
-
-def _session(path: Path, content: bytes, settings: CompletionSettings) -> onnxruntime.InferenceSession:
-    """ONNX Runtime on the CPU; threads sleep between runs, nothing is written to disk."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = settings.intra_op_threads, 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.log_severity_level = 4
-    try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime's own classes have no common root
-        raise ModelError(
-            f"{path}: ONNX Runtime cannot load it ({type(error).__name__})", action="install the model again"
-        ) from error
-
-
-def _read_golden(path: Path, file: str, manifest: Manifest) -> dict[str, Any]:
-    """Known input and the file's known answers, each of the promised shape."""
-    shapes = {
-        "fine": (None, 3),
-        "coarse": (manifest.coarse_points, 3),
-        "class_probability": (len(manifest.classes),),
-    }
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            golden = {name: stored[f"{file}:{name}"] for name in shapes}
-            golden |= {"points": stored["points"], "fine_rows": stored["fine_rows"]}
-    except Exception as error:  # zip, zlib, header and key errors have no common root
-        raise ModelError(f"{path}: no known answer of {file} ({error})", action="install the model again") from error
-    rows = golden["fine_rows"]
-    right = rows.ndim == 1 and rows.dtype.kind == "i" and len(rows) == len(golden["fine"]) > 0
-    right = right and bool(((rows >= 0) & (rows < manifest.fine_points)).all())
-    shapes["points"] = (None, 3)
-    for name, shape in shapes.items():
-        array = golden[name]
-        same = array.ndim == len(shape) and all(s in (None, n) for s, n in zip(shape, array.shape, strict=True))
-        right = right and same and array.dtype == np.float32 and bool(np.isfinite(array).all())
-    if not right:
-        raise ModelError(f"{path}: known answer of {file} has another shape", action="install the model again")
-    return golden

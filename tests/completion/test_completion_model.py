@@ -11,8 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 
+from edge.completion import network
+from edge.completion.golden import PROBE, PROBE_DEPTH, PROBE_SUM
 from edge.completion.manifest import read_manifest
 from edge.completion.model import CompletionModel, confidence
 from edge.completion.sight import turned
@@ -163,8 +167,15 @@ def test_not_finite_clouds_and_answers_are_withheld(model: CompletionModel, gold
     broken[3, 1] = np.nan
     with pytest.raises(ModelError, match="object 7: its points are not finite"):
         model.complete(cloud(broken))
-    with pytest.raises(ModelError, match="answer is not finite"):
+    with pytest.raises(ModelError, match="object 7: its points are not finite and within 1000 m"):
         model.complete(cloud(golden * np.float32(1e38)))
+    run = model.run
+    model.run = lambda points: run(points)._replace(coarse_m=np.full((1024, 3), np.inf, np.float32))  # type: ignore[method-assign]
+    try:
+        with pytest.raises(ModelError, match="answer is not finite"):
+            model.complete(cloud(golden))
+    finally:
+        del model.run
 
 
 def test_the_rig_must_be_one_of_the_manifest(model: CompletionModel) -> None:
@@ -194,7 +205,7 @@ def test_wrong_weights_with_a_right_hash_are_refused(tmp_path: Path, file: str) 
     content = bytearray((SHIPPED / file).read_bytes())
     middle = len(content) // 2
     content[middle : middle + 200_000] = content[middle : middle + 200_000][::-1]
-    with pytest.raises(ModelError, match=r"known input|known answer|cannot load|failed") as caught:
+    with pytest.raises(ModelError, match=r"known input|known answer|cannot load|failed|another graph") as caught:
         CompletionModel.load(resigned(tmp_path, file, bytes(content)), SETTINGS, file=file)
     assert caught.value.exit_code == 6
 
@@ -232,3 +243,50 @@ def test_nothing_is_written_beside_the_model(tmp_path: Path) -> None:
     before = sorted(path.name for path in tmp_path.iterdir())
     CompletionModel.load(tmp_path, SETTINGS)
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_an_int8_file_that_fails_is_replaced_by_the_fp32_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As after weights were altered in place."""
+    content = bytearray((SHIPPED / "model.int8.onnx").read_bytes())
+    at = content.index(numpy_helper.to_array(weight("fold2.w_code")).tobytes())
+    content[at : at + 4000] = content[at : at + 4000][::-1]
+    folder = resigned(tmp_path, "model.int8.onnx", bytes(content))
+    fallen = CompletionModel.load(folder, SETTINGS)
+    assert fallen.file == "model.onnx"
+    assert "known input differs" in fallen.fallback
+    assert "model.onnx runs instead" in caplog.text
+    with pytest.raises(ModelError, match="known input differs"):
+        CompletionModel.load(folder, SETTINGS, file="model.int8.onnx")
+    assert CompletionModel.load(SHIPPED, SETTINGS).fallback == ""
+
+
+def weight(name: str) -> onnx.TensorProto:
+    """A constant of the shipped int8 file."""
+    return next(one for one in onnx.load(SHIPPED / "model.int8.onnx").graph.initializer if one.name == name)
+
+
+def test_when_no_file_gives_its_known_answer_nothing_runs(tmp_path: Path) -> None:
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    with np.load(SHIPPED / "golden.npz") as stored:
+        answers = dict(stored)
+    for name in ("model.onnx:fine", "model.int8.onnx:fine"):
+        answers[name] = answers[name] + np.float32(0.1)
+    np.savez(tmp_path / "golden.npz", **answers)
+    with pytest.raises(ModelError, match=r"model\.onnx: fine of the known input"):
+        CompletionModel.load(tmp_path, SETTINGS)
+
+
+def test_the_self_test_notices_a_processor_on_which_eight_bits_saturate(tmp_path: Path) -> None:
+    """The file's product of the largest codes, given the number that sums of two products in 16 bits would make."""
+    whole = onnx.load(SHIPPED / "model.int8.onnx")
+    right = network.Network((SHIPPED / "model.int8.onnx").read_bytes(), "int8").constant(PROBE)
+    assert (right == PROBE_SUM).all()
+    cut = np.clip(2 * 255 * 127, -(2**15), 2**15 - 1) * PROBE_DEPTH // 2
+    assert cut < PROBE_SUM
+    probe = next(node for node in whole.graph.node if node.output[0] == PROBE)
+    whole.graph.initializer.append(numpy_helper.from_array(np.full_like(right, cut), "saturated"))
+    probe.CopyFrom(onnx.helper.make_node("Identity", ["saturated"], [PROBE]))
+    folder = resigned(tmp_path, "model.int8.onnx", whole.SerializeToString())
+    model = CompletionModel.load(folder, SETTINGS)
+    assert model.file == "model.onnx"
+    assert "eight-bit products saturate" in model.fallback

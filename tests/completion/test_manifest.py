@@ -15,10 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.completion.confidence import ConfidenceModel
 from edge.completion.manifest import find_model, read_files, read_manifest
 from edge.errors import ExitCode, ModelError
 from edge.resources import shipped_dir
 
+HEADS = {"shape": (0.5, 1.0), "class": (0.5, 1.0), "known": (0.5, 1.0, 0.0)}
 SHIPPED = shipped_dir("models") / "default"
 CONTENT: dict[str, Any] = json.loads((SHIPPED / "manifest.json").read_text())
 
@@ -29,6 +31,15 @@ def write(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     change(content)
     (folder / "manifest.json").write_text(json.dumps(content))
     return folder
+
+
+def test_a_manifest_without_classes_or_with_a_confidence_is_read(tmp_path: Path) -> None:
+    trust = ConfidenceModel(("points",), (0.0,), (1.0,), HEADS, 0.6, 0.15)
+    manifest = read_manifest(write(tmp_path, lambda c: c.update(classes=[], confidence=trust.to_dict())))
+    assert manifest.classes == ()
+    assert manifest.confidence == trust
+    with pytest.raises(ModelError, match="confidence"):
+        read_manifest(write(tmp_path, lambda c: c.update(confidence={"names": []})))
 
 
 def test_shipped_manifest_is_read() -> None:
@@ -50,7 +61,7 @@ def test_shipped_manifest_is_read() -> None:
         (lambda c: c["input"].update(points=1), "unknown key input.points"),
         (lambda c: c["golden"].pop("tolerance_m"), "missing key golden.tolerance_m"),
         (lambda c: c["files"][0].pop("sha256"), "missing key files.sha256"),
-        (lambda c: c.update(schema=2), "schema"),
+        (lambda c: c.update(schema=1), "schema"),
         (lambda c: c.update(classes="car"), "key classes"),
         (lambda c: c.update(classes=["car", "car"]), "classes"),
         (lambda c: c.update(classes=["Car/1"]), "classes"),
@@ -63,6 +74,8 @@ def test_shipped_manifest_is_read() -> None:
         (lambda c: c["files"][0].update(sha256="0" * 63), "files.sha256"),
         (lambda c: c["files"][0].update(bytes=2**40), "files.bytes"),
         (lambda c: c["input"].update(frame="odom"), "input.frame"),
+        (lambda c: c["input"].update(columns=5), "input.columns"),
+        (lambda c: c.update(confidence=0.5), "key confidence"),
         (lambda c: c["golden"]["tolerance_m"].pop("model.onnx"), "golden.tolerance_m"),
         (lambda c: c["golden"]["tolerance_m"].update({"model.onnx": float("nan")}), "golden.tolerance_m"),
     ],
@@ -74,7 +87,7 @@ def test_contradiction_is_named(tmp_path: Path, change: Callable[[dict[str, Any]
     assert caught.value.exit_code == ExitCode.BAD_MODEL == 6
 
 
-@pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"schema": 1}', "[" * 100_000, "\udcff"])
+@pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"schema": 2}', "[" * 100_000, "\udcff"])
 def test_no_manifest_at_all(tmp_path: Path, text: str) -> None:
     (tmp_path / "manifest.json").write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(ModelError):

@@ -30,7 +30,7 @@ def test_file_is_unaltered_and_gives_the_golden_answer(entry: dict[str, object])
 
 
 def test_manifest_is_complete() -> None:
-    assert MANIFEST["schema"] == 1
+    assert MANIFEST["schema"] == 2
     assert MANIFEST["classes"] == list(CLASSES)
     assert MANIFEST["default_file"] in {entry["file"] for entry in MANIFEST["files"]}
     assert MANIFEST["input"]["min_points"] == 64
