@@ -68,8 +68,7 @@ def _add_what(fit: argparse.ArgumentParser) -> None:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    alone = "WORLD_SIZE" not in os.environ
-    if options.own_process and alone and any(os.environ.get(name) != value for name, value in _ALLOCATOR.items()):
+    if options.own_process and any(os.environ.get(name) != value for name, value in _ALLOCATOR.items()):
         os.environ.update(_ALLOCATOR)  # read by the C library at start only, hence the new start
         os.execv(sys.executable, [sys.executable, "-m", "train.cli", *sys.argv[1:]])
     from train.fit import FitSettings, Trainer
