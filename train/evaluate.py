@@ -21,7 +21,7 @@ from train.dataset import CLASSES, CompletionDataset, Sample
 from train.held_out import Case, HeldOut, spread
 from train.metrics import Summary, shape_metrics, summarize
 from train.network import Frame
-from train.predictors import Answer, Predictor
+from train.predictors import Answer, Predictor, box_unit
 
 __all__ = ["BIKE", "FLOOR", "MACRO", "PAPER", "OnnxModel", "Scores", "evaluate", "int8_is_good", "measure", "spread"]
 
@@ -67,9 +67,11 @@ class OnnxModel:
     def of(self, sample: Sample) -> Answer:
         """The answer to a sample, metres."""
         points = collate([sample], self.frame, self.columns).points_m.numpy()
-        scale_m = np.float32(np.linalg.norm(sample.size_m)) if self.frame == "box" else np.float32(1)
         fine, coarse, probability = self(points)
-        return Answer(fine * scale_m, coarse * scale_m, probability if self.has_classes else None)
+        if self.frame == "box":
+            unit_m, origin_m = box_unit(sample)
+            fine, coarse = fine * unit_m + origin_m, coarse * unit_m + origin_m
+        return Answer(fine, coarse, probability if self.has_classes else None)
 
 
 @dataclass(slots=True)
