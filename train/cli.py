@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from edge.errors import RfconstructError
+from train.bench_completion import add_verb as add_completion_bench_verb
 from train.evaluate_command import add_verb as add_evaluate_verb
 from train.export_command import add_verb as add_export_verb
 from train.fit_command import add_verb as add_fit_verb
@@ -39,6 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     add_look_verbs(verbs)
     add_evaluate_verb(verbs)
     add_export_verb(verbs)
+    add_completion_bench_verb(verbs)
     object_verbs(verbs)
     return parser
 

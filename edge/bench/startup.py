@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from edge.config import CompletionSettings
 from edge.errors import RfconstructError
 from edge.numba_cache import VARIABLE
 
-Part = Literal["kernels", "pipeline"]
+Part = Literal["kernels", "pipeline", "completion"]
 TIMEOUT_S = 300.0
 
 
@@ -43,7 +44,8 @@ def start(rig_name: str, part: Part, cold: bool = False) -> Start:
 
     Args:
         rig_name: whose kernels.
-        part: "kernels": imager, detector and association alone; "pipeline": the whole road with ONNX Runtime.
+        part: "kernels": imager, detector and association alone; "pipeline": the whole road with ONNX Runtime;
+            "completion": that with the rig's model loaded, after a cloud of the largest size.
         cold: with an empty cache of kernels.
     Raises:
         RfconstructError: the process failed.
@@ -77,10 +79,12 @@ def _be_ready(rig_name: str, part: str) -> None:
     from edge.rig import load_rig
 
     rig = load_rig(rig_name)
-    if part == "pipeline":
+    if part in ("pipeline", "completion"):
         from edge.warm import warm_up
 
         warm_up(rig)
+        if part == "completion":
+            _complete(rig.settings.completion)
         return
     from edge.dsp.detector import Detector
     from edge.dsp.imager import Imager
@@ -94,6 +98,17 @@ def _be_ready(rig_name: str, part: str) -> None:
         imager = Imager(rig.radars[radar], rig.settings.heatmap, rig.settings.antenna)
         found.append(Detector(rig.radars[radar], rig.settings.cfar).process(imager.process(frames[radar])))
     Associator(rig).process(found[0], found[1], None)
+
+
+def _complete(settings: CompletionSettings) -> None:
+    import numpy as np
+
+    from edge.completion.manifest import find_model
+    from edge.completion.model import CompletionModel
+
+    model = CompletionModel.load(find_model(settings.model), settings)
+    cloud = np.random.default_rng(0).normal(size=(settings.max_points, model.manifest.columns)).astype(np.float32)
+    model.run(cloud)
 
 
 if __name__ == "__main__":
