@@ -16,6 +16,7 @@ import pytest
 from onnx import numpy_helper
 
 from edge.completion import network
+from edge.completion.confidence import ConfidenceModel
 from edge.completion.golden import PROBE, PROBE_DEPTH, PROBE_SUM
 from edge.completion.manifest import read_manifest
 from edge.completion.model import CompletionModel, confidence
@@ -48,11 +49,12 @@ def model() -> CompletionModel:
     return CompletionModel.load(SHIPPED, SETTINGS)
 
 
-def framed(folder: Path, frame: str) -> CompletionModel:
-    """The shipped network, with a manifest that promises this input frame."""
+def framed(folder: Path, frame: str, confidence: ConfidenceModel | None = None) -> CompletionModel:
+    """The shipped network, with a manifest that promises this input frame and this confidence."""
     shutil.copytree(SHIPPED, folder, dirs_exist_ok=True)
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["input"]["frame"] = frame
+    manifest["confidence"] = None if confidence is None else confidence.to_dict()
     (folder / "manifest.json").write_text(json.dumps(manifest))
     return CompletionModel.load(folder, SETTINGS, file="model.onnx")
 
@@ -290,3 +292,51 @@ def test_the_self_test_notices_a_processor_on_which_eight_bits_saturate(tmp_path
     model = CompletionModel.load(folder, SETTINGS)
     assert model.file == "model.onnx"
     assert "eight-bit products saturate" in model.fallback
+
+
+def test_a_calibrated_confidence_is_taken_from_the_manifest(tmp_path: Path, golden: Float32) -> None:
+    """A constant logistic model: ln 4 is a chance of 0.8, of a road user in all cases."""
+    heads = {"shape": (math.log(4), 0.0), "class": (math.log(9), 0.0), "known": (30.0, 0.0, 0.0)}
+    for below, expected in ((0.85, False), (0.95, True)):
+        trust = ConfidenceModel(("points",), (0.0,), (1.0,), heads, below, 0.15)
+        shape = framed(tmp_path / str(below), "line_of_sight", trust).complete(cloud(golden, frames=20))
+        assert shape is not None
+        assert shape.confidence == pytest.approx(0.8)
+        assert (shape.class_name == "unknown") is expected
+
+
+def test_a_model_of_the_box_frame_completes_only_where_the_box_is_known(tmp_path: Path, golden: Float32) -> None:
+    model = framed(tmp_path, "box")
+    with pytest.raises(ModelError, match="no box is known"):
+        model.complete(cloud(golden))
+    assert model.run(golden).fine_m.shape == (16384, 3)
+
+
+def test_a_network_without_a_classifier_publishes_unknown(tmp_path: Path, golden: Float32) -> None:
+    whole = onnx.load(SHIPPED / "model.onnx")
+    loop = next(node for node in whole.graph.node if node.op_type == "Loop")
+    body, name = loop.attribute[0].g, "class_probability"
+    at = [one.name for one in body.output].index(f"{name}_of_one")
+    del body.output[at], loop.output[at - 1], whole.graph.output[[o.name for o in whole.graph.output].index(name)]
+    folder = resigned(tmp_path, "model.onnx", whole.SerializeToString())
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest |= {"classes": [], "default_file": "model.onnx"}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with np.load(SHIPPED / "golden.npz") as stored:
+        answers = dict(stored)
+    answers[f"model.onnx:{name}"] = np.empty(0, np.float32)
+    np.savez(folder / "golden.npz", **answers)
+    shape = CompletionModel.load(folder, SETTINGS).complete(cloud(golden))
+    assert shape is not None
+    assert shape.class_name == "unknown"
+    assert shape.class_probability == {"unknown": 1.0}
+    assert shape.confidence == 1.0
+
+
+def test_counts_that_do_not_fit_the_points_are_refused(model: CompletionModel, golden: Float32) -> None:
+    for counts in ([], [0, len(golden)], [len(golden) - 1]):
+        with pytest.raises(ModelError, match="counts do not fit"):
+            model.run_all(golden, counts)
+    both = model.run_all(np.concatenate([golden, golden[:100]]), [len(golden), 100])
+    np.testing.assert_array_equal(both.fine_m[0], model.run(golden).fine_m)
+    np.testing.assert_array_equal(both.fine_m[1], model.run(golden[:100]).fine_m)
