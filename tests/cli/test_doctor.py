@@ -93,7 +93,8 @@ def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(doctor_command.metadata, "version", without)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.delitem(sys.modules, "edge.completion.model", raising=False)
+    for module in ("model", "network"):
+        monkeypatch.delitem(sys.modules, f"edge.completion.{module}", raising=False)
     checks = outcomes()
     assert checks["packages"] == {
         "name": "packages", "outcome": "fails", "found": "not installed: msgpack", "action": "pip install msgpack",

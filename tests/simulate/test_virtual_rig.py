@@ -315,7 +315,7 @@ def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     expected = ["command", "data", "cli"]
     assert parts == [f"{radar}.{part}" for radar in RADARS for part in expected] + ["pose", "faults"]
     assert main([*words, "--source", "--pace", "0"]) == 0
-    assert capsys.readouterr().out.splitlines()[1].startswith("late because they were not made in time: 0")
+    assert capsys.readouterr().out.splitlines()[2].startswith("late because they were not made in time: 0")
     assert main(["rig", "no_such_rig"]) != 0
     assert main([*words, "--fault", "melt x"]) != 0
     assert "unknown fault" in capsys.readouterr().err
