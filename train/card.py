@@ -12,10 +12,9 @@ from train.evaluate import BIKE, FLOOR, MACRO, Scores, table
 
 _LIMITS = """## Limits
 
-- Trained and measured on simulated, geometrically perturbed clouds of 3-D meshes only: no radar recording was used.
-  Figures on real radar clouds are unknown and must be expected to be worse.
-- Four classes; anything else is forced into one of them.
-  The class probability is not calibrated.
+- Trained and measured on simulated data only: no radar recording was used. Figures on real radar clouds are unknown
+  and must be expected to be worse. The table above is of perturbed depth scans; drive-bys: docs/results.md.
+- Four classes; the probabilities of the classes are not calibrated, the confidence is (where the manifest has one).
 - Posture, wheels and mirrors come from the training shapes, not from measurement.
 - Neither speed nor motion of the object is modelled.
 - Published tables of other networks use other data and other conventions: do not compare.
@@ -52,7 +51,7 @@ def write_card(
         "from the ground.",
         "## Training",
         f"{training['samples']} samples in {training['seconds']} s on {training['device']}, seed {training['seed']}; "
-        f"{training['parameters']} parameters.\n{training['dataset']}.",
+        f"{_before(training)}{training['parameters']} parameters.\n{training['dataset']}.",
         f"```\n{commands['fit']}\n```",
         "## Held-out objects",
         f"Mean Chamfer distance **{head.mean:.2f} cm** (macro over classes; bootstrap 95 % interval over objects "
@@ -73,6 +72,12 @@ def write_card(
         _LIMITS,
     ]
     path.write_text("<!-- SPDX-License-Identifier: Apache-2.0 -->\n\n" + "\n\n".join(parts))
+
+
+def _before(training: dict[str, Any]) -> str:
+    """What the weights had seen when the run began."""
+    count = training.get("samples_before", 0)
+    return f"the weights it began with had seen {count} samples; " if count else ""
 
 
 def _precision(scores: dict[str, Scores], files: dict[str, str]) -> str:

@@ -132,8 +132,11 @@ def _measure(options: argparse.Namespace, checkpoint: Checkpoint, network: Compl
 def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) -> dict[str, Any]:
     metrics = ("cd_cm", "accuracy_cm", "completeness_cm", "emd_cm", "f_5cm", "f_10cm", "f_1pct", "class_right")
     settings = checkpoint.settings
+    share = settings.get("data", {}).get("simulated_share", 0.0)
+    drive_bys = f"; {100 * share:.0f} % simulated drive-bys as the pipeline saw them" if share else ""
     return {
         "samples": checkpoint.samples,
+        "samples_before": settings.get("samples_before", 0),
         "seconds": round(checkpoint.elapsed_s),
         "seed": settings["seed"],
         "network": settings.get("network", "ours"),
@@ -142,7 +145,7 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
         "parameters": network.parameter_count,
         "device": f"{settings['device']} ({platform.machine()}, {settings['threads']} threads, other work beside it)",
         "dataset": "Partial clouds made from meshes on the fly (visible surface, holes, noise spheres, ghosts), "
-        f"{_DATASET[network.frame]}; simulated geometry, no radar data",
+        f"{_DATASET[network.frame]}; simulated geometry{drive_bys}, no radar recording",
         "settings": settings,
         "metrics": {
             "split": "test",
@@ -154,11 +157,15 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
 
 def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, str]:
     source, target = options.source.resolve().parent.name, options.target.name
+    start, data = settings.get("start", ""), settings.get("data", {})
+    more = f" --start runs/{Path(start).parent.name}/{Path(start).name}" if start else ""
+    if "simulated_share" in data:
+        more += f" --simulated DRIVE_BYS --simulated-share {data['simulated_share']:g}"
     given: Callable[[str], str] = lambda name: f"--{name.replace('_', '-')} {getattr(options, name)}"  # noqa: E731
     return {
         "fit": f"rfconstruct-train fit runs/{source} --network {settings.get('network', 'ours')} "
         f"--width {settings['width']} --minutes {settings['budget_s'] / 60:g} --batch {settings['batch']} "
-        f"--seed {settings['seed']}",
+        f"--rate {settings['rate']:g} --seed {settings['seed']}{more}",
         "export": f"rfconstruct-train export runs/{source}/checkpoint.pt models/{target} "
         + " ".join(given(name) for name in ("samples", "emd_samples", "bank")),
     }
