@@ -129,21 +129,7 @@ def spreader(width: int, shape: float, plane: int) -> Callable[..., None]:
 
     @njit(**OPTIONS)
     def spread(  # type: ignore[no-untyped-def]
-        count,
-        re_out,
-        im_out,
-        cell_out,
-        cell_back,
-        base,
-        swing,
-        swing_step,
-        legs,
-        turn,
-        run,
-        onward,
-        plan,
-        start,
-        grid,
+        count, re_out, im_out, cell_out, cell_back, base, swing, swing_step, legs, turn, run, onward, plan, start, grid
     ):
         slots, begin, room = len(re_out), uint64(0), uint64(swing.shape[1] // 2)
         for chip in range(len(legs)):
@@ -151,23 +137,7 @@ def spreader(width: int, shape: float, plane: int) -> Callable[..., None]:
             mean, rate, turned = cell_back[0, chip], cell_back[1, chip], swing[chip]
             for slot in range(slots):
                 re, im, cell, late = re_out[slot], im_out[slot], cell_out[slot], float32(slot - 0.5 * (slots - 1))
-                _plan(
-                    count,
-                    re,
-                    im,
-                    cell,
-                    mean,
-                    rate,
-                    late,
-                    turned,
-                    base,
-                    width,
-                    b,
-                    outer,
-                    first_ratio,
-                    plan,
-                    start,
-                )
+                _plan(count, re, im, cell, mean, rate, late, turned, base, width, b, outer, first_ratio, plan, start)
                 for x in range(begin, begin + imaginary + imaginary):
                     grid[x] = float32(0)
                 _add(count, span, table, plan, start, short, steps, lanes, imaginary, bend, begin, grid)
