@@ -82,6 +82,26 @@ class WireError(RfconstructError):
     """A message that does not follow the wire format."""
 
 
+class DeviceError(RfconstructError):
+    """A board, card or sensor that does not do what it was asked."""
+
+    exit_code = ExitCode.NO_HARDWARE
+
+
+class LinkError(DeviceError):
+    """A device that does not answer, answers too late or half, or whose connection broke."""
+
+
+class RefusalError(DeviceError):
+    """A device that answered no: a NACK, an error code, an error line."""
+
+
+class FirmwareError(DeviceError):
+    """A firmware image that is absent, or is not the one it should be; or a board that runs another."""
+
+    exit_code = ExitCode.BAD_CONFIG
+
+
 class DependencyError(RfconstructError):
     """A command needs an optional package that is not installed."""
 

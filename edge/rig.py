@@ -6,13 +6,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edge.array import VirtualArray, array_for
+from edge.board_settings import BoardSettings, PoseSettings
 from edge.calibration import Calibration, load_calibration
 from edge.calibration_ti import import_ti_calibration
 from edge.config import Mounting, PipelineSettings, RigGeometry, require
@@ -20,13 +21,14 @@ from edge.constraints import DRIFT_S_PER_S, REARM_S, Constraint, check_interleav
 from edge.errors import ConfigError
 from edge.frames import RADARS, RadarId
 from edge.resources import shipped_dir
+from edge.rig_boards import read_boards
 from edge.rig_toml import Place, fill, merged, read_toml, require_known, subtable
 from edge.waveform import Schedule
 
 FILE_NAME = "rig.toml"
 SETTINGS = tuple(f.name for f in fields(PipelineSettings))
-TOP_KEYS = ("description", "schedule", "interleave", "geometry", "radars", *SETTINGS)
-RADAR_KEYS = ("mounting", "calibration", "schedule")
+TOP_KEYS = ("description", "schedule", "interleave", "geometry", "radars", "pose", *SETTINGS)
+RADAR_KEYS = ("mounting", "calibration", "schedule", "board")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,8 @@ class Rig:
         directory: the rig's folder.
         description: one line for people.
         interleave: how the two radars share the time.
+        boards: where each radar is reached.
+        pose: where poses come from.
     """
 
     name: str
@@ -86,6 +90,8 @@ class Rig:
     directory: Path
     description: str = ""
     interleave: InterleaveSettings = InterleaveSettings()
+    boards: dict[RadarId, BoardSettings] = field(default_factory=dict)
+    pose: PoseSettings = field(default_factory=PoseSettings)
 
     @property
     def config_hash(self) -> bytes:
@@ -156,11 +162,12 @@ def find_rig(name_or_directory: str | Path) -> Path:
     )
 
 
-def load_rig(name_or_directory: str | Path) -> Rig:
+def load_rig(name_or_directory: str | Path, boards: Path | None = None) -> Rig:
     """Read a rig and check it against the hardware's rules.
 
     Args:
         name_or_directory: folder with ``rig.toml``, or the name of one in ``firmware_cfg``.
+        boards: file that overrides where boards and pose sensor are reached (``edge/rig_boards.py``).
     Raises:
         ConfigError: no such rig; unknown key, wrong type or unit; a rule of the hardware is broken; the two radars have
             different range bins or overlap in time.
@@ -173,14 +180,18 @@ def load_rig(name_or_directory: str | Path) -> Rig:
     description = table.get("description", "")
     if not isinstance(description, str):
         raise place.at("description").error("wrong type", value=description, allowed="text")
+    radars = _radars(table, place)
+    reached, pose = read_boards(table, {r: x.schedule.is_cascade for r, x in radars.items()}, place, boards)
     rig = Rig(
         name=directory.resolve().name,
-        radars=_radars(table, place),
+        radars=radars,
         geometry=fill(RigGeometry, subtable(table, "geometry", place), place.at("geometry")),
         settings=fill(PipelineSettings, {key: subtable(table, key, place) for key in SETTINGS}, place),
         directory=directory,
         description=description,
         interleave=fill(InterleaveSettings, subtable(table, "interleave", place), place.at("interleave")),
+        boards=reached,
+        pose=pose,
     )
     require_passed(rig.constraints(), f"{place.file}: the schedule")
     return rig
