@@ -14,6 +14,9 @@ from edge.config import require
 
 FetchKind = Literal["ssh", "folder"]
 PoseKind = Literal["none", "oak", "zmq", "recorded", "constant"]
+PoseOf = Literal["sensor", "rig"]
+OdometryNode = Literal["basalt", "rtabmap"]
+SenderClock = Literal["fit", "monotonic", "realtime", "tai", "utc"]
 LARGEST_PORT = 65535
 
 
@@ -111,6 +114,11 @@ class PoseSettings:
         max_turn_rate_deg_s: above it the odometry is marked as doubtful (BasaltVIO drifts beyond 15 deg/s).
         position_m, roll_deg, pitch_deg, yaw_deg: of the sensor's frame (x forward, y left, z up) in the vehicle frame.
         timeout_s: without a pose for so long the source is said to be dead and, where it can be, restarted.
+        poses_of: "zmq" and "recorded": poses are of the sensor, mounted as above, or already of the rig.
+        vio: odometry node of the OAK.
+        clock: "zmq": clock of the sender's time stamps. "fit": its own, mapped to ours by a line fitted to arrivals;
+            "monotonic", "realtime", "tai": this host's clock of that name, which the sender shares (it runs here, or
+            PTP or GPS keeps the two together); "utc": its own, with the UTC that each message carries.
     """
 
     kind: PoseKind = "none"
@@ -126,8 +134,12 @@ class PoseSettings:
     pitch_deg: float = 0.0
     yaw_deg: float = 0.0
     timeout_s: float = 1.0
+    poses_of: PoseOf = "sensor"
+    vio: OdometryNode = "basalt"
+    clock: SenderClock = "fit"
 
     def __post_init__(self) -> None:
+        require(self.kind != "oak" or self.poses_of == "sensor", "pose.poses_of", self.poses_of, '"sensor" for an OAK')
         require(self.kind != "recorded" or bool(self.file), "pose.file", self.file, 'a file, with kind = "recorded"')
         require(self.kind != "zmq" or bool(self.endpoint), "pose.endpoint", self.endpoint, "a ZeroMQ address")
         require(abs(self.speed_m_s) <= 60.0, "pose.speed_m_s", self.speed_m_s, "-60..60")
