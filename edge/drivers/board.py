@@ -32,8 +32,8 @@ class StartTimes:
 class Board(Protocol):
     """One radar with what captures its samples. Methods are called from one thread, in the order of this list.
 
-    Every method ends within a stated time. All but ``plan`` and ``close`` raise DeviceError: LinkError (nothing answers,
-    or too late), RefusalError (the board said no, and why), FirmwareError.
+    Every method ends within a stated time. All but ``plan`` and ``close`` raise DeviceError: LinkError (no answer, or
+    too late), RefusalError (the board said no, and why), FirmwareError.
     """
 
     radar: RadarId
