@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge.completion.confidence import ConfidenceModel, Trust, measures, quadratic, standardised
+from edge.completion.confidence import ConfidenceModel, Trust, head_terms, measures, standardised
 from edge.completion.model import UNKNOWN
 from edge.config import require
 from edge.frames import Float64
@@ -23,6 +23,10 @@ SHAPE_LIMIT_M = 0.15
 """The paper's Chamfer distance without box priors; a better shape counts as right."""
 CLUTTER_SHARE = 0.25
 """Weight of clutter in the fit of "known", against that of road users: a segment is a road user more often than not."""
+RISING = frozenset({"points", "frames", "odds", "near"})
+FALLING = frozenset({"below", "away", "sigma"})
+"""Measures that can only speak for, or only against, a right shape and class. A fit free to choose found that fewer
+frames are better, because the validation split has few such clouds."""
 _RIDGE = 1.0
 _NEWTON_STEPS = 30
 _UNKNOWN_RANGE = (0.5, 0.8)
@@ -100,13 +104,13 @@ def fit_confidence(seen: Observations, limit_m: float = SHAPE_LIMIT_M) -> Confid
     values = np.array([[one[name] for name in names] for one in seen.measured])
     mean, scale = values.mean(axis=0), values.std(axis=0)
     scale = np.where(scale > 1e-9, scale, 1.0)
-    terms = quadratic(standardised(values, mean, scale))
-    linear = terms[seen.known, : 1 + len(names)]
+    linear, products = head_terms(names, standardised(values, mean, scale))
+    signs = np.array([0, *((name in RISING) - (name in FALLING) for name in names)])
     weight = np.where(seen.known, 1.0, CLUTTER_SHARE / (1 - CLUTTER_SHARE) * objects / others)
     heads = {
-        "shape": logistic_fit(linear, seen.cd_m[seen.known] < limit_m),
-        "class": logistic_fit(linear, seen.right[seen.known]),
-        "known": logistic_fit(terms, seen.known, weight),
+        "shape": signed_fit(linear[seen.known], seen.cd_m[seen.known] < limit_m, signs),
+        "class": signed_fit(linear[seen.known], seen.right[seen.known], signs),
+        "known": logistic_fit(products, seen.known, weight),
     }
     rounded = {head: tuple(float(f"{value:.6g}") for value in weights) for head, weights in heads.items()}
     middle, width = (tuple(float(f"{value:.6g}") for value in column) for column in (mean, scale))
@@ -114,6 +118,22 @@ def fit_confidence(seen: Observations, limit_m: float = SHAPE_LIMIT_M) -> Confid
     named = [model.trust(one).class_right for one, known in zip(seen.measured, seen.known, strict=True) if not known]
     below = float(np.clip(np.quantile(named, 1 - _CLUTTER_NAMED), *_UNKNOWN_RANGE))
     return replace(model, unknown_below=round(below, 3))
+
+
+def signed_fit(terms: Float64, event: np.ndarray, signs: np.ndarray) -> Float64:
+    """As ``logistic_fit``, where a weight that comes out against its sign is held at 0 and the others are fitted again.
+
+    Args:
+        terms, event: as there. signs: [k], 1: not negative, -1: not positive, 0: free.
+    """
+    kept = np.ones(terms.shape[1], dtype=bool)
+    while True:
+        beta = np.zeros(terms.shape[1])
+        beta[kept] = logistic_fit(terms[:, kept], event)
+        wrong = beta * signs < 0
+        if not wrong.any():
+            return beta
+        kept &= ~wrong
 
 
 def logistic_fit(terms: Float64, event: np.ndarray, weight: Float64 | None = None) -> Float64:

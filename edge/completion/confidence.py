@@ -23,6 +23,8 @@ _INPUT_ROWS, _SURFACE_ROWS = 256, 2048
 _CUT = 4.0
 """Standardised measures are cut here: nothing is extrapolated far beyond the fit."""
 _ODDS_LIMIT = 6.0
+AMOUNTS = ("points", "frames")
+"""How much was seen. "known" does not depend on it, so that less is never trusted more."""
 _FAR_M, _LEAST_M = 1.0, 0.02
 
 
@@ -125,14 +127,15 @@ def _axes(cloud: Float32) -> tuple[float, float]:
 class ConfidenceModel:
     """Three logistic models over standardised measures z, each cut at 4 standard deviations.
 
-    Shape and class are linear in z; "known" also has all products of two, because what is odd is the combination: as
-    narrow as a pole and yet a pedestrian.
+    Shape and class are linear in z, and never fall with the amount of points and frames. "known" leaves these two out
+    and has all products of two others, because what is odd is the combination: as narrow as a pole and yet a
+    pedestrian.
 
     Args:
         names: measures that are used, in order.
         mean, scale: of each over the data of the fit.
-        heads: "shape", "class" -> a constant and one weight for every z; "known" -> these, and one for every product
-            z_i z_j, i <= j, in the order of ``quadratic``.
+        heads: "shape", "class" -> a constant and one weight for every z; "known" -> the same for every z that is no
+            amount, and one weight for every product z_i z_j of these, i <= j, in the order of ``quadratic``.
         unknown_below: below this probability of the right class the class is "unknown".
         shape_limit_m: what "shape" promises.
     """
@@ -156,9 +159,10 @@ class ConfidenceModel:
         if not np.isfinite(values).all():
             missing = [name for name, value in zip(self.names, values, strict=True) if not math.isfinite(value)]
             raise ModelError(f"confidence: no value of {', '.join(missing)}", action="use the model's own manifest")
-        terms = quadratic(standardised(values[None], np.array(self.mean), np.array(self.scale)))[0]
-        weights = [np.array(self.heads[head]) for head in HEADS]
-        shape, right, known = (_logistic(float(terms[: len(weight)] @ weight)) for weight in weights)
+        z = standardised(values[None], np.array(self.mean), np.array(self.scale))
+        linear, products = (terms[0] for terms in head_terms(self.names, z))
+        terms = {"shape": linear, "class": linear, "known": products}
+        shape, right, known = (_logistic(float(terms[head] @ np.array(self.heads[head]))) for head in HEADS)
         return Trust(known * shape, known * right, known)
 
     def is_unknown(self, trust: Trust) -> bool:
@@ -190,8 +194,8 @@ class ConfidenceModel:
         count = len(model.names)
         weights = [value for head in model.heads.values() for value in head]
         numbers = [*model.mean, *model.scale, *weights, model.unknown_below, model.shape_limit_m]
-        linear = 1 + count
-        lengths = {"shape": linear, "class": linear, "known": linear + count * linear // 2}
+        linear, product = (terms.shape[1] for terms in head_terms(model.names, np.zeros((1, count))))
+        lengths = {"shape": linear, "class": linear, "known": product}
         rules = (
             (set(content) == set(cls.__slots__), f"keys {sorted(content)}"),
             (count > 0 and len(model.mean) == len(model.scale) == count, f"{count} measures"),
@@ -210,6 +214,12 @@ def standardised(values: Float64, mean: Float64, scale: Float64) -> Float64:
     """Measures [n, k] in standard deviations, cut at 4."""
     z: Float64 = np.clip((values - mean) / scale, -_CUT, _CUT)
     return z
+
+
+def head_terms(names: Sequence[str], z: Float64) -> tuple[Float64, Float64]:
+    """Terms [n, ..] of the linear heads and of "known", from standardised measures z [n, k] called ``names``."""
+    kind = [column for column, name in enumerate(names) if name not in AMOUNTS]
+    return np.concatenate([np.ones((len(z), 1)), z], axis=1), quadratic(z[:, kind])
 
 
 def quadratic(z: Float64) -> Float64:

@@ -296,7 +296,7 @@ def test_the_self_test_notices_a_processor_on_which_eight_bits_saturate(tmp_path
 
 def test_a_calibrated_confidence_is_taken_from_the_manifest(tmp_path: Path, golden: Float32) -> None:
     """A constant logistic model: ln 4 is a chance of 0.8, of a road user in all cases."""
-    heads = {"shape": (math.log(4), 0.0), "class": (math.log(9), 0.0), "known": (30.0, 0.0, 0.0)}
+    heads = {"shape": (math.log(4), 0.0), "class": (math.log(9), 0.0), "known": (30.0,)}
     for below, expected in ((0.85, False), (0.95, True)):
         trust = ConfidenceModel(("points",), (0.0,), (1.0,), heads, below, 0.15)
         shape = framed(tmp_path / str(below), "line_of_sight", trust).complete(cloud(golden, frames=20))

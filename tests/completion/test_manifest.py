@@ -20,7 +20,7 @@ from edge.completion.manifest import find_model, read_files, read_manifest
 from edge.errors import ExitCode, ModelError
 from edge.resources import shipped_dir
 
-HEADS = {"shape": (0.5, 1.0), "class": (0.5, 1.0), "known": (0.5, 1.0, 0.0)}
+HEADS = {"shape": (0.5, 1.0), "class": (0.5, 1.0), "known": (0.5,)}
 SHIPPED = shipped_dir("models") / "default"
 CONTENT: dict[str, Any] = json.loads((SHIPPED / "manifest.json").read_text())
 

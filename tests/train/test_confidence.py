@@ -14,7 +14,7 @@ from edge.completion.sight import turned
 from edge.errors import ConfigError, ModelError
 from edge.frames import Float32
 from train.calibration import reliability, risk_coverage
-from train.confidence import Observations, fit_confidence, logistic_fit
+from train.confidence import Observations, fit_confidence, logistic_fit, signed_fit
 from train.degrade import CLUTTER, clutter
 
 RNG = np.random.default_rng
@@ -63,11 +63,13 @@ def test_logistic_fit_recovers_known_weights() -> None:
 def observations(count: int, seed: int) -> Observations:
     """Road users whose fate follows from two measures, and clutter about a point away from them."""
     rng, others = RNG(seed), count // 4
-    near, points = rng.normal(size=count), rng.normal(size=count)
+    near, points, long = rng.normal(size=count), rng.normal(size=count), rng.normal(size=count)
     good = rng.uniform(size=count) < 1 / (1 + np.exp(-(0.5 + 2 * near + points)))
     right = rng.uniform(size=count) < 1 / (1 + np.exp(-(1.5 + points)))
-    measured = [{"near": float(a), "points": float(b)} for a, b in zip(near, points, strict=True)]
-    ring = [{"near": 5 * math.cos(a), "points": 5 * math.sin(a)} for a in rng.uniform(0, 2 * math.pi, others)]
+    names = ("near", "points", "long")
+    measured = [dict(zip(names, map(float, one), strict=True)) for one in zip(near, points, long, strict=True)]
+    turn = rng.uniform(0, 2 * math.pi, others)
+    ring = [{"near": 5 * math.cos(a), "points": float(rng.normal()), "long": 5 * math.sin(a)} for a in turn]
     cd_m = np.concatenate([np.where(good, 0.05, 0.3), np.full(others, np.nan)])
     return Observations(
         measured + ring, cd_m, np.concatenate([right, np.zeros(others, bool)]), np.arange(count + others) < count
@@ -87,6 +89,30 @@ def test_fitted_confidence_keeps_its_promises_and_knows_clutter() -> None:
     )  # a ring about all
     with pytest.raises(ConfigError, match="confidence"):
         fit_confidence(observations(8, 0))
+
+
+def test_less_is_never_trusted_more() -> None:
+    """Even where the data say so by chance: here the fate of shape and class is better with fewer points."""
+    data = observations(2000, 0)
+    turned_round = replace(data, measured=[one | {"points": -one["points"]} for one in data.measured])
+    model = fit_confidence(turned_round)
+    one = {"near": 0.5, "long": 0.0}
+    few, many = (model.trust(one | {"points": points}) for points in (-2.0, 2.0))
+    assert few == many
+    few, many = (fit_confidence(data).trust(one | {"points": points}) for points in (-2.0, 2.0))
+    assert few.shape < many.shape
+    assert few.class_right < many.class_right
+    assert few.known == many.known
+
+
+def test_signed_fit_holds_wrong_signs_at_zero() -> None:
+    rng = RNG(5)
+    terms = np.concatenate([np.ones((20_000, 1)), rng.normal(size=(20_000, 2))], axis=1)
+    event = rng.uniform(size=20_000) < 1 / (1 + np.exp(-terms @ np.array([0.5, 1.5, -1.0])))
+    np.testing.assert_allclose(signed_fit(terms, event, np.array([0, 1, -1])), [0.5, 1.5, -1.0], atol=0.06)
+    held = signed_fit(terms, event, np.array([0, 1, 1]))
+    assert held[2] == 0
+    np.testing.assert_allclose(held[:2], logistic_fit(terms[:, :2], event))
 
 
 def test_measures_of_known_clouds() -> None:
@@ -120,12 +146,13 @@ def test_the_manifest_section_is_read_as_written_and_checked() -> None:
     model = fit_confidence(observations(200, 0))
     again = ConfidenceModel.from_dict(model.to_dict())
     assert again == model
-    assert again.trust({"near": 0.3, "points": -1.0}) == model.trust({"points": -1.0, "near": 0.3})
+    one = {"near": 0.3, "points": -1.0, "long": 0.2}
+    assert again.trust(one) == model.trust(dict(reversed(one.items())))
     good = model.to_dict()
     bad: list[dict[str, object]] = [
         {"names": []},
-        {"scale": [0.0, 1.0]},
-        {"mean": [math.nan, 0.0]},
+        {"scale": [0.0, 1.0, 1.0]},
+        {"mean": [math.nan, 0.0, 0.0]},
         {"unknown_below": 2},
         {"heads": good["heads"] | {"class": (1.0,)}},
         {"heads": {head: good["heads"][head] for head in HEADS[:2]}},
@@ -138,7 +165,7 @@ def test_the_manifest_section_is_read_as_written_and_checked() -> None:
     with pytest.raises(ModelError, match="confidence section"):
         ConfidenceModel.from_dict(None)
     with pytest.raises(ModelError, match="near"):
-        model.trust({"points": 0.0, "near": math.nan})
+        model.trust({"points": 0.0, "near": math.nan, "long": 0.0})
     assert not replace(model, unknown_below=0.0).is_unknown(model.trust({"near": 0.0, "points": 0.0}))
 
 
