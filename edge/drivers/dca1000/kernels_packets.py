@@ -19,14 +19,23 @@ H = 10
 SOL_SOCKET, SO_TIMESTAMPNS, SO_RXQ_OVFL = 1, 35, 40
 """Linux, asm-generic."""
 
-BASE, HIGHEST, BEGUN, OUTSIDE_IN_A_ROW, TOP_SLOT = 0, 1, 2, 3, 4
+BASE, HIGHEST, BEGUN, OUTSIDE_IN_A_ROW, TOP_SLOT, FIRST_NS = 0, 1, 2, 3, 4, 5
 """State: oldest open frame; end of the furthest byte; a packet came; foreign positions in a row; last slot with an
-entry in ``got``."""
-STATE_SIZE = 5
+entry in ``got``; arrival of the recording's first packet."""
+STATE_SIZE = 6
 PACKETS, BYTES, PLACED, DUPLICATE, DUPLICATE_BYTES, LATE, LATE_BYTES = 0, 1, 2, 3, 4, 5, 6
 GARBAGE, GARBAGE_BYTES, FOREIGN, FOREIGN_BYTES, OUTSIDE, OUTSIDE_BYTES, REORDERED, HEADERS = 7, 8, 9, 10, 11, 12, 13, 14
 COUNTERS = 15
 """Counters: packets and their bytes, sample bytes placed, packets and bytes by what became of them, header bytes."""
+
+
+@njit(inline="always", **OPTIONS)
+def _little(row, place, size):  # type: ignore[no-untyped-def]
+    """Little-endian unsigned integer of up to 8 bytes."""
+    value = int64(0)
+    for k in range(size):
+        value |= int64(row[place + k]) << (8 * k)
+    return value
 
 
 @njit(
@@ -37,7 +46,7 @@ def read_control(control, lengths, count, shift_ns, stamps, drops):  # type: ign
     """Arrival times and the kernel's count of dropped packets, from the control messages of a batch.
 
     Args:
-        control: uint8 [batch, bytes]: struct cmsghdr {u64 length, i32 level, i32 type} and data, each at a multiple of 8.
+        control: uint8 [batch, bytes]: struct cmsghdr {u64 length, i32 level, i32 type} and data, each at 8 k.
         lengths: int64 [batch], bytes in use.
         count: packets of the batch.
         shift_ns: CLOCK_MONOTONIC minus CLOCK_REALTIME.
@@ -57,15 +66,6 @@ def read_control(control, lengths, count, shift_ns, stamps, drops):  # type: ign
             elif level == SOL_SOCKET and kind == SO_RXQ_OVFL and length >= 20:
                 drops[0] = _little(control[n], place + 16, 4)
             place += (length + 7) // 8 * 8
-
-
-@njit(inline="always", **OPTIONS)
-def _little(row, place, size):  # type: ignore[no-untyped-def]
-    """Little-endian unsigned integer of up to 8 bytes."""
-    value = int64(0)
-    for k in range(size):
-        value |= int64(row[place + k]) << (8 * k)
-    return value
 
 
 @njit(
@@ -127,7 +127,8 @@ def place(  # type: ignore[no-untyped-def]
             counters[OUTSIDE_BYTES] += payload
             state[OUTSIDE_IN_A_ROW] += 1
             continue
-        state[BEGUN] = 1
+        if not state[BEGUN]:
+            state[BEGUN], state[FIRST_NS] = 1, stamps[n]
         state[OUTSIDE_IN_A_ROW] = 0
         before = int64(got[slot % slots])
         twice = min(before, payload)
