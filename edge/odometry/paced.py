@@ -36,6 +36,7 @@ class PacedSource:
         self._shift_ns = 0
         self._next: Pose | None = None
         self._news: list[Pose | PoseEvent] = []
+        self._error: PoseError | None = None
 
     @property
     def name(self) -> str:
@@ -69,6 +70,9 @@ class PacedSource:
         Raises:
             PoseError: a line of the file is no pose.
         """
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
         deadline_ns = time.monotonic_ns() + round(timeout_s * NS_PER_S)
         due_ns = deadline_ns if self._next is None else min(deadline_ns, self._next.t_ns + self._shift_ns)
         if not self._news:
@@ -77,7 +81,6 @@ class PacedSource:
         now_ns = time.monotonic_ns()
         while self._next is not None and self._next.t_ns + self._shift_ns <= now_ns and len(items) < MOST_AT_ONCE:
             moved = Pose(self._next.t_ns + self._shift_ns, self._next.position_m, self._next.quaternion_xyzw)
-            self._next = None  # should the next line be none, the source has ended
             pose = self._placement.rig(moved)
             if self._meter.accept(pose):
                 items.append(pose)
@@ -91,9 +94,9 @@ class PacedSource:
     def _advance(self, items: list[Pose | PoseEvent]) -> Pose | None:
         try:
             following = next(self._poses, None)
-        except PoseError:
-            self._meter.state = "ended"
-            raise
+        except PoseError as error:  # after the poses before it
+            self._error, self._meter.state = error, "ended"
+            return None
         if following is None:
             self._meter.state = "ended"
             items.append(PoseEvent("ended", time.monotonic_ns(), f"{self._name}: last pose"))
