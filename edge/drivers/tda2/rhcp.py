@@ -109,6 +109,8 @@ REFUSALS = {
     160: "dummy chirp at the end of the frame",
 }
 ALREADY_STOPPED = 21
+TRANSIENT = frozenset({6, 7})
+"""Refusals that a reset and a new transfer may cure."""
 CALIBRATIONS = {
     1: "APLL",
     2: "VCO1",

@@ -117,9 +117,7 @@ def load_steps(phase: str, devices: tuple[int, ...], chunks: list[bytes]) -> lis
     firmware = [
         Command(f"firmware {k + 1}/{len(chunks)}", FILE, chunk, len(chunks) - 1 - k) for k, chunk in enumerate(chunks)
     ]
-    power_up = Command(
-        "RF power-up", RADAR_POWER_UP, event=Event.RADAR_POWERED_UP, event_wait="radar_power_up_s"
-    )
+    power_up = Command("RF power-up", RADAR_POWER_UP, event=Event.RADAR_POWERED_UP, event_wait="radar_power_up_s")
     others = [
         Command("CRC-32 in answers", CRC_TYPE, struct.pack("<3I", 1, 0, 0)),
         power_up,
