@@ -52,6 +52,7 @@ class CaptureFolder:
     Attributes:
         gaps: places where the board's time stamps are more than 10 % further apart than the frame period.
         notes: what a reader of the results should know, in sentences.
+        board_start_ns: the board's own stamp of the first frame; None: there is no index.
     Raises:
         CaptureError: no capture; a device's file is missing or not expected; size, count, loops or time contradict the
             schedule or each other.
@@ -184,12 +185,14 @@ class CaptureFolder:
         """Instants and numbers of all frames: a number is skipped where the board's clock skipped a period."""
         total = self.total_frames
         self.gaps: list[Gap] = []
+        self.board_start_ns: int | None = None
         stamps = [segment.t_ns for segment in self._segments if segment.t_ns is not None]
         if len(stamps) < len(self._segments):
             self.notes.append("no index files: times are frame number times the schedule's period, gaps are unknown")
             numbers = np.arange(total, dtype=np.int64)
             return (t_start_ns or 0) + np.round(numbers * (period_s * 1e9)).astype(np.int64), numbers
         t_ns = np.concatenate(stamps)
+        self.board_start_ns = int(t_ns[0])
         steps_s = np.diff(t_ns) / 1e9
         measured_s = float(np.median(steps_s)) if len(steps_s) else period_s
         if abs(measured_s - period_s) > GAP_TOLERANCE * period_s:

@@ -13,7 +13,8 @@ import pytest
 
 from edge.constraints import GUARD_S
 from edge.drivers.board import Board, Progress, StartTimes
-from edge.drivers.interleave import ATTEMPTS, InterleaveStarter, MonotonicClock, OffsetWatch, PhaseLine, window_of
+from edge.drivers.interleave import ATTEMPTS, InterleaveStarter, MonotonicClock, OffsetWatch
+from edge.drivers.offset import PhaseLine, window_of
 from edge.errors import ConfigError, LinkError
 from edge.frames import Float64, RadarId
 from edge.rig import Rig, load_rig
@@ -135,17 +136,27 @@ def test_start_at_half_a_period() -> None:
 
 def test_a_late_answer_is_tried_again() -> None:
     """An answer 20 ms late leaves open where in the period the frames began: stopped, armed, started again."""
-    clock, armed = VirtualClock(), []
+    clock, armed = VirtualClock(), list[int]()
     first, second = VirtualBoard("horizontal", clock), VirtualBoard("vertical", clock)
     second.slow_answers_s = [20e-3, 0.0]
     started = InterleaveStarter(CASCADE, clock).start(first, second, lambda: armed.append(clock.now_ns()))
-    assert (started.attempts, second.stops, len(armed), first.starts) == (2, 1, 1, 1)
+    assert (started.attempts, first.stops, second.stops, len(armed), first.starts) == (2, 1, 1, 1, 2)
     assert started.offset_s == pytest.approx(1 / 120, abs=1e-5)
+    assert started.times["vertical"].sent_ns > armed[0]
+
+
+def test_the_second_alone_is_tried_again() -> None:
+    clock = VirtualClock()
+    first, second = VirtualBoard("horizontal", clock), VirtualBoard("vertical", clock)
+    starter, reference = InterleaveStarter(CASCADE, clock), first.start()
+    second.slow_answers_s = [20e-3]
+    started = starter.start_second(reference, second, "horizontal", nothing)
+    assert (started.attempts, first.stops, second.stops) == (2, 0, 1)
     second.slow_answers_s = [20e-3] * 2 * ATTEMPTS
     with pytest.raises(LinkError, match="between the bursts") as caught:
-        InterleaveStarter(CASCADE, clock).start(first, second, nothing)
+        starter.start_second(reference, second, "horizontal", nothing)
     assert len(second.slow_answers_s) == ATTEMPTS
-    assert "4.82" not in caught.value.allowed, "the guard for the drift until the next re-arm counts too"
+    assert "7.22..9.45" in caught.value.allowed, "the guard for the drift until the next re-arm counts too"
 
 
 def test_by_hardware_nothing_is_timed() -> None:
