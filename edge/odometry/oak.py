@@ -46,6 +46,8 @@ OLDEST_S = 5.0
 """A pose older than this at its arrival has a wrong time."""
 TRUST_AFTER_S = 0.5
 """The odometry counts as doubtful until so long after the vehicle turned too fast."""
+TURN_SPAN_S = 0.2
+"""Without a gyroscope the turn rate is that of the poses over so long."""
 LONGEST_WAIT_S = 0.1
 
 
@@ -189,9 +191,11 @@ class OakSource:
 
     def _guard(self, pose: Pose, turn_rate_rad_s: float) -> None:
         """Mark the odometry as doubtful while the vehicle turns too fast for it."""
-        if not math.isfinite(turn_rate_rad_s) and self._last is not None:
-            turn_rate_rad_s = quaternion_turn_rad(self._last, pose) * NS_PER_S / (pose.t_ns - self._last.t_ns)
-        self._last = pose
+        span_ns = 0 if self._last is None else pose.t_ns - self._last.t_ns
+        if self._last is None or span_ns >= TURN_SPAN_S * NS_PER_S:
+            if self._last is not None and not math.isfinite(turn_rate_rad_s):
+                turn_rate_rad_s = quaternion_turn_rad(self._last, pose) * NS_PER_S / span_ns
+            self._last = pose
         if turn_rate_rad_s > self._limit_rad_s:
             if self._doubtful_until_ns is None:
                 text = (
