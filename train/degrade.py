@@ -13,8 +13,6 @@ from edge.frames import Float32
 from train.held_out import Case
 
 _LEAST_POINTS, _MOST_POINTS = 64, 2048
-_LEAST_OF_FRAMES = 24
-"""Points that are left of a cloud with fewer frames: with less the edge finds no object (``ObjectSettings``)."""
 _GHOST_SIGMA_M = 0.1
 _OUTLIER_MARGIN_M = 0.5
 _GAP_M = (0.5, 1.5)
@@ -29,7 +27,7 @@ def frames(case: Case, level: float, rng: Generator, others: Sequence[Case]) -> 
         return None
     first = (case.frames - level) / 2
     seen = (case.frame_number >= first) & (case.frame_number < first + level)
-    return case.seen_as(case.sample.partial[seen], int(level)) if seen.sum() >= _LEAST_OF_FRAMES else None
+    return case.seen_as(case.sample.partial[seen], int(level)) if seen.sum() >= _LEAST_POINTS else None
 
 
 def points(case: Case, level: float, rng: Generator, others: Sequence[Case]) -> Case | None:

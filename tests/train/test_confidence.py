@@ -166,7 +166,7 @@ def test_the_manifest_section_is_read_as_written_and_checked() -> None:
         ConfidenceModel.from_dict(None)
     with pytest.raises(ModelError, match="near"):
         model.trust({"points": 0.0, "near": math.nan, "long": 0.0})
-    assert not replace(model, unknown_below=0.0).is_unknown(model.trust({"near": 0.0, "points": 0.0}))
+    assert not replace(model, unknown_below=0.0).is_unknown(model.trust({"near": 0.0, "points": 0.0, "long": 0.0}))
 
 
 def test_quadratic_terms_in_order() -> None:
