@@ -19,8 +19,8 @@ from edge.errors import LinkError
 from edge.frames import RadarId
 from edge.rig import Rig
 
-SPIN_S = 1e-3
-"""Before the instant of a start the clock is polled for so long: a sleep ends late by up to this much."""
+SPIN_S = 5e-3
+"""Before the instant of a start the clock is polled for so long: on two busy cores a sleep ended up to 4 ms late."""
 ATTEMPTS = 8
 """Starts of the second radar before it is given up; a host that is busy for once misses one or two."""
 LEAD_PERIODS = 3
@@ -45,7 +45,7 @@ class MonotonicClock:
         return time.monotonic_ns()
 
     def sleep_until(self, t_ns: int) -> None:
-        """Sleep until 1 ms before, then poll."""
+        """Sleep until 5 ms before, then poll."""
         rest_s = (t_ns - time.monotonic_ns()) / NS_PER_S - SPIN_S
         if rest_s > 0:
             time.sleep(rest_s)

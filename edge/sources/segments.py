@@ -137,7 +137,7 @@ class SegmentSource:
         self._rig, self._boards, self._fetchers = rig, dict(boards), fetchers
         self._frames, self._segments, self._folder, self._poses = frames, segments, folder, poses
         self._keep, self._say, self._closed, self._broken = keep, say, False, False
-        self._asked = stopped
+        self._asked, self._discarded = stopped, set[tuple[RadarId, str]]()
         periods = {radar: x.schedule.frame_period_s_actual for radar, x in rig.radars.items()}
         self._period_s = max(periods.values())
         self._clocks = {radar: BoardClock(period_s) for radar, period_s in periods.items()}
@@ -190,7 +190,7 @@ class SegmentSource:
             times = {radar: board.start() for radar, board in self._boards.items()}
         else:
             first, second = (self._boards[radar] for radar in RADARS)
-            start = self._starter.start(first, second, self._arm)
+            start = self._starter.start(first, second, self._arm_again)
             times = start.times
         self._say(f"segment {number}: {self._frames} frames{f', {start.text()}' if start else ''}")
         last_ns = max(each.answered_ns for each in times.values())
@@ -205,6 +205,14 @@ class SegmentSource:
         for board in self._boards.values():
             board.arm(self._frames)
 
+    def _arm_again(self) -> None:
+        """After a start that missed its window: what was recorded is of no use."""
+        self._discard()
+        self._arm()
+
+    def _discard(self) -> None:
+        self._discarded |= {(radar, Path(board.directory).name) for radar, board in self._boards.items()}
+
     def _revive(self) -> None:
         """Set the boards up anew, one after the other."""
         for radar, board in self._boards.items():
@@ -218,6 +226,7 @@ class SegmentSource:
     def _fail(self, number: int, error: DeviceError) -> Iterator[Loss]:
         """Nothing of this segment will come; the boards are set up anew before the next one."""
         self._broken = True
+        self._discard()
         self.reports.append(SegmentReport(number, None, {}, 0.0, str(error)))
         self._say(f"segment {number} failed: {error}")
         for radar in self._boards:
@@ -295,12 +304,15 @@ class SegmentSource:
         """A segment that was played takes no space, here or there."""
         if self._keep:
             return
-        for radar, board in self._boards.items():
+        self._discard()
+        for radar, session in sorted(self._discarded):
             try:
-                self._fetchers[radar].delete(Path(board.directory).name)
+                if session:
+                    self._fetchers[radar].delete(session)
             except DeviceError as error:
                 self._say(f"{radar}: {error}")
             shutil.rmtree(self._folder / radar, ignore_errors=True)
+        self._discarded.clear()
 
 
 def _instant_ns(item: Item) -> int:
