@@ -144,7 +144,7 @@ def place(  # type: ignore[no-untyped-def]
             counters[LATE_BYTES] += late
             counters[LATE] += 1
             fresh += late
-        counters[REORDERED] += end < state[HIGHEST]
+        counters[REORDERED] += fresh < end and end < state[HIGHEST]
         state[HIGHEST] = max(state[HIGHEST], end)
         while fresh < end:
             frame = fresh // size
