@@ -47,6 +47,7 @@ def add_verb(verbs: Any) -> None:
     verb.add_argument("--pace", type=float, default=1.0, help="1: real time, 2: twice as fast, 0: as fast as it goes")
     verb.add_argument("--root", type=Path, help="folder of the capture boards' disks (default: a temporary one)")
     verb.add_argument("--links", type=Path, help="folder with links <radar> to the serial terminals")
+    verb.add_argument("--write-boards", type=Path, metavar="FILE", help="for rfconstruct run --boards FILE")
     verb.add_argument("--real-ports", action="store_true", help="127.0.0.180 and .181, ports 5001, 4096, 4098")
     verb.add_argument("--control-port", type=int, default=0, help="of the control socket (default: any free one)")
     verb.add_argument("--quick", action="store_true", help="no delays of boards at configuration and start")
@@ -59,6 +60,7 @@ def add_verb(verbs: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """The verb; returns the exit code."""
+    from train.simulate.boards_file import data_targets, write_boards
     from train.simulate.faults import Faults
     from train.simulate.rig import VirtualRig
     from train.simulate.rig_control import set_fault
@@ -74,7 +76,12 @@ def run(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         root = options.root or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rfconstruct-rig-")))
         stop = stack.enter_context(_interrupts())
-        rig = stack.enter_context(VirtualRig(scene.rig, scene.supply, root, scene.poses, _settings(options), faults))
+        settings = _settings(options)
+        if options.write_boards is not None:
+            settings = replace(settings, data_targets=data_targets(scene.rig))
+        rig = stack.enter_context(VirtualRig(scene.rig, scene.supply, root, scene.poses, settings, faults))
+        if options.write_boards is not None:
+            write_boards(options.write_boards, rig)
         for part, address in rig.addresses().items():
             print(f"{part:20s} {address}", flush=True)
         end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
