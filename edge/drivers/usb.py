@@ -58,8 +58,8 @@ MODELS = (
         0x1CBE,
         (0x00FF,),
         "XDS110 in DFU mode",
-        action="the debugger waits for firmware: unplug it and plug it in again; if it stays so, load its firmware with "
-        "TI's xdsdfu (xdsdfu -m, xdsdfu -f firmware.bin -r)",
+        action="it waits for firmware: unplug it and plug it in again; if it stays so, load its firmware with TI's "
+        "xdsdfu (xdsdfu -m, xdsdfu -f firmware.bin -r)",
     ),
     UsbModel("cp2105", 0x10C4, (0xEA70,), "radar board (CP2105 bridge)", ((0, "cli"), (1, "data"))),
     UsbModel("devpack", 0x0451, (0xFD03,), "DCA1000 or DevPack (FT4232H)"),
