@@ -102,14 +102,17 @@ class Trainer:
     def _load_start(network: CompletionModel, path: Path) -> int:
         """Averaged weights of another run; returns the samples it had seen."""
         earlier = load_checkpoint(path)
+        refusal = ModelError(
+            f"{path}: weights of another network",
+            value=earlier.settings.get("network", "ours"),
+            action="fine-tune with the network and width of that run, and at least its options",
+        )
         try:
-            network.load_state_dict(earlier.average)
+            found = network.load_state_dict(earlier.average, strict=False)
         except RuntimeError as error:
-            raise ModelError(
-                f"{path}: weights of another network",
-                value=earlier.settings.get("network", "ours"),
-                action="fine-tune with the network, width and options of that run",
-            ) from error
+            raise refusal from error
+        if found.unexpected_keys or not network.begin_without(found.missing_keys):
+            raise refusal
         return earlier.samples + int(earlier.settings.get("samples_before", 0))
 
     def _description(self) -> dict[str, Any]:

@@ -125,6 +125,10 @@ class CompletionModel(nn.Module):
     def start_from(self, shape_m: Float32) -> None:
         """Make the untrained network answer with this shape: float32 [coarse points, 3], from the input's centre."""
 
+    def begin_without(self, missing: Sequence[str]) -> bool:
+        """Let parameters that a network of fewer options lacks begin at no effect; False: that is another network."""
+        return not missing
+
     def to_units(self, points_m: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Centred points in network units [n, 3], the centres [b, 3] in the input's unit, the cloud of every point [n].
 

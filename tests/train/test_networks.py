@@ -113,6 +113,18 @@ def test_with_all_switches_off_ours_is_the_papers_and_attention_starts_at_no_mov
         torch.testing.assert_close(ours(points, [150]).coarse, reference.coarse, atol=1e-6, rtol=0)
 
 
+def test_options_that_are_added_to_trained_weights_begin_at_no_effect() -> None:
+    plain, points = CompletionNetwork(WIDTHS["tiny"], 4), cloud(150, 3)
+    richer = OurNetwork(WIDTHS["tiny"], 4, "sight", OurOptions(mirror="cue", attention="tokens", uncertainty=True))
+    missing = richer.load_state_dict(plain.state_dict(), strict=False).missing_keys
+    assert richer.begin_without(missing)
+    with torch.no_grad():
+        torch.testing.assert_close(richer(points, [150]).fine, plain(points, [150]).fine, atol=1e-6, rtol=0)
+    assert richer.begin_without([])
+    assert not richer.begin_without([*missing, "fc.0.weight"])
+    assert not plain.begin_without(missing)
+
+
 def test_mirror_image() -> None:
     points = torch.tensor([[[1.0, 2.0, 3.0], [0.0, 0.5, 1.0]]])
     about_y = torch.tensor([[0.0, 1.0, 0.5]])

@@ -27,6 +27,8 @@ LANDMARKS = 128
 """Coarse points that the others look at."""
 GROUND_M, GROUND_WIDTH_M = 0.2, 0.05
 HEADS = 4
+ADDED = ("plane", "of_mirror", "of_evidence", "token_", "coarse_in", "coarse_block", "coarse_move", "sigma")
+"""Beginnings of the names of layers that options add."""
 POWER_DB = 10.0
 """Decibels of one unit of the power input."""
 
@@ -107,6 +109,16 @@ class OurNetwork(CompletionNetwork):
         if self.options.uncertainty:
             self.sigma.weight.zero_()
             self.sigma.bias.fill_(-5)
+
+    @torch.no_grad()
+    def begin_without(self, missing: Sequence[str]) -> bool:
+        """See ``CompletionModel``: options that a network of this width was trained without."""
+        if not all(name.split(".")[0].startswith(ADDED) for name in missing):
+            return False
+        for layer in (getattr(self, name, None) for name in ("of_mirror", "of_evidence")):
+            if isinstance(layer, nn.Linear) and missing:
+                layer.weight.zero_()
+        return True
 
     def forward(self, points_m: Tensor, counts: Sequence[int], cells: Tensor | None = None) -> Completion:
         """See ``CompletionModel.forward``; with the power option a fourth column holds dB about the cloud's median."""
