@@ -97,52 +97,39 @@ class InterleaveStarter:
         self.by_hardware = all(radar.schedule.hardware_trigger for radar in rig.radars.values())
         self._clock: Clock = clock or MonotonicClock()
 
-    def start(self, first: Board, second: Board, rearm: Callable[[], None]) -> InterleavedStart:
+    def start(
+        self, first: Board, second: Board, rearm: Callable[[], None], restart_both: bool = False
+    ) -> InterleavedStart:
         """Start both.
 
         Args:
             first, second: armed.
-            rearm: arms both again after a start that missed the window; they are stopped before.
+            rearm: arms the second board again after a start that missed the window; it is stopped before.
+            restart_both: then both are stopped, ``rearm`` arms both, and both are started: where a board needs
+                seconds to be armed and records a given number of frames.
         Raises:
             DeviceError: of the boards; LinkError: the window was missed in every attempt.
         """
-        tried: list[str] = []
+        reference, tried = first.start(), list[str]()
+        if self.by_hardware:
+            both: dict[RadarId, StartTimes] = {first.radar: reference, second.radar: second.start()}
+            return InterleavedStart(both, self.window.target_s, 0.0, 1)
         for attempt in range(1, ATTEMPTS + 1):
-            reference = first.start()
-            if self.by_hardware:
-                both: dict[RadarId, StartTimes] = {first.radar: reference, second.radar: second.start()}
-                return InterleavedStart(both, self.window.target_s, 0.0, attempt)
             started = self._try(reference, second, first.radar, attempt, tried)
             if started is not None:
                 return started
-            for board in (second, first):
-                board.stop()
-            if attempt < ATTEMPTS:
-                rearm()
-        raise self._missed(first.radar, second.radar, tried)
-
-    def start_second(
-        self, reference: StartTimes, second: Board, reference_radar: RadarId, rearm: Callable[[], None]
-    ) -> InterleavedStart:
-        """Start the second board into the gaps of the first, which runs.
-
-        Args:
-            reference: when a burst of the first one began; any of them.
-            second: armed.
-            reference_radar: the first one's id.
-            rearm: arms the second again after a start that missed the window; it is stopped before.
-        Raises:
-            DeviceError: as for ``start``.
-        """
-        tried: list[str] = []
-        for attempt in range(1, ATTEMPTS + 1):
-            started = self._try(reference, second, reference_radar, attempt, tried)
-            if started is not None:
-                return started
             second.stop()
+            if restart_both:
+                first.stop()
             if attempt < ATTEMPTS:
                 rearm()
-        raise self._missed(reference_radar, second.radar, tried)
+                reference = first.start() if restart_both else reference
+        raise LinkError(
+            f"{second.radar} radar could not be started between the bursts of the {first.radar} one",
+            value="offsets and their spread " + ", ".join(tried),
+            allowed=f"{1e3 * self.window.earliest_s:.2f}..{1e3 * self.window.latest_s:.2f} ms",
+            action="the answers of the boards vary too much: end other work on this computer, use a direct cable",
+        )
 
     def _try(
         self, reference: StartTimes, second: Board, reference_radar: RadarId, attempt: int, tried: list[str]
@@ -156,14 +143,6 @@ class InterleaveStarter:
             return None
         both: dict[RadarId, StartTimes] = {reference_radar: reference, second.radar: times}
         return InterleavedStart(both, (0.5 * (low_s + high_s)) % self.window.period_s, high_s - low_s, attempt)
-
-    def _missed(self, first: RadarId, second: RadarId, tried: list[str]) -> LinkError:
-        return LinkError(
-            f"{second} radar could not be started between the bursts of the {first} one",
-            value="offsets and their spread " + ", ".join(tried),
-            allowed=f"{1e3 * self.window.earliest_s:.2f}..{1e3 * self.window.latest_s:.2f} ms",
-            action="the answers of the boards vary too much: end other work on this computer, use a direct cable",
-        )
 
     def _next_start_ns(self, reference_ns: int) -> int:
         """Earliest instant at the target offset that leaves time to get ready."""
