@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from edge.completion.confidence import ConfidenceModel
 from train.evaluate import BIKE, FLOOR, MACRO, Scores, table
+
+_FRAMES = {
+    "sight": "Input and output are in the line-of-sight frame: x horizontal and away from the sensor's mean position, "
+    "z up from the ground.",
+    "box": "Input and output are in the object's own frame: the middle of its box at 0, lengths in box diagonals.",
+}
 
 _LIMITS = """## Limits
 
@@ -28,6 +35,7 @@ def write_card(
     files: dict[str, str],
     training: dict[str, Any],
     commands: dict[str, str],
+    confidence: ConfidenceModel | None = None,
 ) -> None:
     """Write card.md.
 
@@ -38,6 +46,7 @@ def write_card(
         files: precision -> predictor name in ``scores``, the default one first.
         training: as in the manifest.
         commands: "fit" and "export": how the weights and the figures were made.
+        confidence: of the manifest.
     """
     shown = next(iter(files.values()))
     rows = [(f"**{class_name}**", shown, class_name) for class_name in [*scores[shown].classes, BIKE, MACRO]]
@@ -47,8 +56,7 @@ def write_card(
         f"# Model card: {name}",
         "Completes a sparse, noisy, partial cloud of a road user to 16,384 points at true scale, and names its class.\n"
         "Cascaded PointNet encoder, coarse decoder, folding with local features (the paper's shape completion).\n"
-        "Input and output are in the line-of-sight frame: x horizontal and away from the sensor's mean position, z up "
-        "from the ground.",
+        f"{_FRAMES[training['frame']]}",
         "## Training",
         f"{training['samples']} samples in {training['seconds']} s on {training['device']}, seed {training['seed']}; "
         f"{_before(training)}{training['parameters']} parameters.\n{training['dataset']}.",
@@ -69,6 +77,8 @@ def write_card(
         "The int8 file is the default when its CD is at most 1 % above that of the fp32 file in every class "
         "of the validation split; the fp32 file is the portable one.",
         _precision(scores, files),
+        "## Confidence",
+        _confidence(confidence),
         _LIMITS,
     ]
     path.write_text("<!-- SPDX-License-Identifier: Apache-2.0 -->\n\n" + "\n\n".join(parts))
@@ -78,6 +88,20 @@ def _before(training: dict[str, Any]) -> str:
     """What the weights had seen when the run began."""
     count = training.get("samples_before", 0)
     return f"the weights it began with had seen {count} samples; " if count else ""
+
+
+def _confidence(confidence: ConfidenceModel | None) -> str:
+    if confidence is None:
+        return (
+            "None was fitted: the runtime publishes class probability times what points and frames allow, "
+            "which orders shapes and is no rate of being right."
+        )
+    return (
+        f"Chance that the shape is within {100 * confidence.shape_limit_m:.0f} cm (CD) of the truth, from "
+        f"{len(confidence.names)} measures ({', '.join(confidence.names)}); fitted on the validation split, on these "
+        f"clouds worsened, and on clutter.\nThe class is published as `unknown` where the chance that it is right is "
+        f"below {confidence.unknown_below:g}. Figures of the test split, and what it does on clutter: docs/results.md."
+    )
 
 
 def _precision(scores: dict[str, Scores], files: dict[str, str]) -> str:

@@ -126,7 +126,8 @@ def _measure(options: argparse.Namespace, checkpoint: Checkpoint, network: Compl
     rigs = options.rig or ["cascade_pair"]
     write_manifest(folder, name, default, network, classes, rigs, tolerance_m, confidence, training)
     files = {"int8": SMALL, "fp32": FULL} if default == SMALL else {"fp32": FULL, "int8": SMALL}
-    write_card(folder / "card.md", name, scores, files, training, _commands(options, checkpoint.settings))
+    commands = _commands(options, checkpoint.settings)
+    write_card(folder / "card.md", name, scores, files, training, commands, confidence)
 
 
 def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) -> dict[str, Any]:
