@@ -102,10 +102,14 @@ class Packet:
 
 
 class PacketReader:
-    """Cuts the board's byte stream into packets, however the bytes arrive."""
+    """Cuts a byte stream into packets, however the bytes arrive.
 
-    def __init__(self) -> None:
-        self._bytes = bytearray()
+    Args:
+        sync: of whom the stream comes from.
+    """
+
+    def __init__(self, sync: int = BOARD_SYNC) -> None:
+        self._sync, self._bytes = sync, bytearray()
 
     @property
     def pending(self) -> int:
@@ -127,15 +131,15 @@ class PacketReader:
             end = _LENGTH.size + length
             if len(self._bytes) < end:
                 break
-            packets.append(_parse(bytes(self._bytes[_LENGTH.size : end])))
+            packets.append(_parse(bytes(self._bytes[_LENGTH.size : end]), self._sync))
             del self._bytes[:end]
         return packets
 
 
-def _parse(body: bytes) -> Packet:
+def _parse(body: bytes, expected_sync: int) -> Packet:
     sync, opcode, ack_code, counted, device, ack_type = _HEAD.unpack_from(body)
-    if sync != BOARD_SYNC:
-        raise PacketError(f"sync word 0x{sync:04x} instead of 0x{BOARD_SYNC:04x}")
+    if sync != expected_sync:
+        raise PacketError(f"sync word 0x{sync:04x} instead of 0x{expected_sync:04x}")
     (crc,) = _CRC.unpack_from(body, len(body) - _CRC.size)
     expected = crc16(body[2 : -_CRC.size])
     if crc != expected:

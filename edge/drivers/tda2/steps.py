@@ -118,14 +118,14 @@ def load_steps(phase: str, devices: tuple[int, ...], chunks: list[bytes]) -> lis
         Command(f"firmware {k + 1}/{len(chunks)}", FILE, chunk, len(chunks) - 1 - k) for k, chunk in enumerate(chunks)
     ]
     power_up = Command("RF power-up", RADAR_POWER_UP, event=Event.RADAR_POWERED_UP, event_wait="radar_power_up_s")
-    others = [
-        Command("CRC-32 in answers", CRC_TYPE, struct.pack("<3I", 1, 0, 0)),
-        power_up,
+    together = [*firmware, Command("CRC-32 in answers", CRC_TYPE, struct.pack("<3I", 1, 0, 0)), power_up]
+    alone = (
         Command("version of the master sub-system", MASTER_VERSION),
         Command("version of the radar sub-system", RADAR_VERSION),
         Command("die id", DIE_ID),
-    ]
-    return [Step(phase, devices, command) for command in (*firmware, *others)]
+    )
+    steps = [Step(phase, devices, command) for command in together]
+    return steps + [Step(phase, (device,), command) for device in devices for command in alone]
 
 
 def role_steps(phase: str, devices: tuple[int, ...]) -> list[Step]:
