@@ -157,7 +157,7 @@ def test_both_are_started_again() -> None:
     starter = InterleaveStarter(CASCADE, clock)
     started = starter.start(first, second, lambda: armed.append(clock.now_ns()), restart_both=True)
     assert (started.attempts, first.stops, second.stops, first.starts) == (2, 1, 1, 2)
-    assert started.times["horizontal"].sent_ns > armed[0]
+    assert started.times["horizontal"].sent_ns >= armed[0]
 
 
 def test_by_hardware_nothing_is_timed() -> None:
