@@ -7,7 +7,7 @@ import tracemalloc
 
 import pytest
 
-from edge.timing import KEPT, StageTimes
+from edge.timing import BOUNDS_US, KEPT, StageTimes
 
 
 def test_percentiles_of_a_ramp() -> None:
@@ -54,3 +54,17 @@ def test_memory_does_not_grow_with_the_run() -> None:
     grown, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert grown < 4096
+
+
+def test_histogram_puts_a_bound_into_its_own_bucket_and_the_rest_into_the_last() -> None:
+    times = StageTimes()
+    for microseconds in (0.0, 10.0, 10.1, 20.0, 5e6, 5.1e6):
+        times.record("a", microseconds)
+    histogram = times.histograms()["a"]
+    assert BOUNDS_US[:3] == (10.0, 20.0, 50.0)
+    assert BOUNDS_US[-1] == 5e6
+    assert len(histogram.counts) == len(BOUNDS_US) + 1
+    assert histogram.counts[:3] == (2, 2, 0)
+    assert histogram.counts[-2:] == (1, 1)
+    assert histogram.sum_us == pytest.approx(0.0 + 10.0 + 10.1 + 20.0 + 5e6 + 5.1e6)
+    assert sum(histogram.counts) == times.summary()["a"].count
