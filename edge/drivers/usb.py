@@ -27,6 +27,8 @@ RULES_ACTION = (
 REENUMERATION_LIMIT_S = 10.0
 """After a reset the kernel needs 1-2 s to bind the ports again, udev a moment more for their rights."""
 REENUMERATION_STEP_S = 0.1
+STEADY_LOOKS = 5
+"""So often in a row the port must be there: right after the reset the old one may still be listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,11 +233,12 @@ def reset(
     if not found:
         raise LinkError(f"libusb does not see the device at {board.location}", action="check /dev/bus/usb")
     _reset(found[0], board)
-    deadline_s = time.monotonic() + limit_s
+    deadline_s, seen = time.monotonic() + limit_s, 0
     while time.monotonic() < deadline_s:
         time.sleep(REENUMERATION_STEP_S)
         back = [b for b in look() if b.role == "cli" and b.serial_number == serial_number and b.accessible]
-        if back:
+        seen = seen + 1 if back else 0
+        if seen >= STEADY_LOOKS:
             return back[0].path
     raise LinkError(
         f"{board.model.name} {serial_number} did not come back after its reset",
