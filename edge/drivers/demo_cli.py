@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import termios
 import time
 from collections.abc import Callable, Iterable
 
@@ -29,6 +30,8 @@ SHOWN = 120
 BANNER = "****"
 CLI_INTERFACE = 0
 """USB interface of the command line, on XDS110 and on CP2105."""
+GONE = (OSError, termios.error, TypeError)
+"""What pyserial raises when a port vanishes, or is closed, under it; SerialException is an OSError."""
 PROBES = {(0x0451, 0xBEF3): "XDS110", (0x0451, 0xBEF4): "XDS110", (0x10C4, 0xEA70): "CP2105"}
 
 
@@ -48,7 +51,7 @@ class DemoCli:
         self.port, self.name, self._answer_s = port, name, answer_s
         try:
             self._serial = serial.Serial(port, baud_rate, timeout=READ_S, write_timeout=answer_s, exclusive=True)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, termios.error) as error:
             raise LinkError(
                 f"serial port of the {name} cannot be opened",
                 value=f"{port}: {error}",
@@ -126,9 +129,9 @@ class DemoCli:
 
     def close(self) -> None:
         """Give the port back; never raises."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(*GONE):
             self._serial.reset_output_buffer()  # a hung port would wait for what it never takes
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(*GONE):
             self._serial.close()
 
     def _until_prompt(self, buffer: bytes, line: str, end_s: float) -> bytes:
@@ -179,7 +182,7 @@ class DemoCli:
     def _guarded(self, action: Callable[[], object]) -> None:
         try:
             action()
-        except (OSError, TypeError, serial.SerialException) as error:  # TypeError: closed under the reader
+        except GONE as error:
             raise LinkError(
                 f"serial port of the {self.name} is gone",
                 value=f"{self.port}: {error}",

@@ -266,7 +266,7 @@ class SingleChipDriver:
         return self.receiver
 
     def _configure(self, progress: Progress) -> list[str]:
-        card, total = self.card, len(self._lines) + 3
+        card, total = self.card, len(self._lines) + 2
         progress(f"{self.radar}: reset", 0, total)
         card.stop()
         self._cli.discard()

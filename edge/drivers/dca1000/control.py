@@ -194,7 +194,7 @@ class CaptureCard:
             ) from error
 
     def _receive(self, timeout_s: float) -> Answer | None:
-        """Next answer; reports are put aside; None: nothing in time."""
+        """Next answer or report, which is kept for ``poll`` too; None: nothing in time."""
         end_s = time.monotonic() + timeout_s
         opened = self._open_socket
         while select.select([opened], [], [], max(0.0, end_s - time.monotonic()))[0]:
@@ -208,10 +208,10 @@ class CaptureCard:
                 continue  # ICMP error of an earlier packet
             if sender[0] != self._address[0]:
                 self.strangers += 1
-            elif not answer.is_status:
-                return answer
-            else:
+                continue
+            if answer.is_status:
                 self._report(Status(answer.status))
+            return answer
         return None
 
     def _report(self, status: Status) -> None:

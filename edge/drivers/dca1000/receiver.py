@@ -236,7 +236,7 @@ class CardReceiver:
         """
         with self._change:
             if not self._queue and timeout_s > 0:
-                self._change.wait_for(lambda: bool(self._queue) or self._error is not None, timeout_s)
+                self.wait(timeout_s)
             if self._queue:
                 item = self._queue.popleft()
                 self._waiting_frames -= item.data is not None
@@ -244,6 +244,11 @@ class CardReceiver:
             if self._error is not None:
                 raise self._error
             return None
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a frame or loss waits; waits for one at most ``timeout_s``."""
+        with self._change:
+            return self._change.wait_for(lambda: bool(self._queue) or self._error is not None, timeout_s)
 
     def wait_first(self, timeout_s: float) -> int | None:
         """Arrival of the recording's first packet of samples, CLOCK_MONOTONIC in ns; None: it did not come in time."""
@@ -255,6 +260,16 @@ class CardReceiver:
     def last_packet_ns(self) -> int:
         """When packets were received last, CLOCK_MONOTONIC; 0: never."""
         return self._last_ns
+
+    @property
+    def recording(self) -> int:
+        """Number of the present recording; frames carry it."""
+        return self._assembler.recording
+
+    @property
+    def outside_in_a_row(self) -> int:
+        """Latest packets that all belonged to places far away."""
+        return self._assembler.outside_in_a_row
 
     @property
     def notes(self) -> list[str]:
