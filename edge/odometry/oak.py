@@ -21,7 +21,7 @@ from edge.config import RigGeometry
 from edge.errors import DependencyError, DeviceError, PoseError
 from edge.frames import Pose
 from edge.odometry.child import Child, exit_text
-from edge.odometry.oak_child import EXIT_NO_PACKAGE, OFFLINE
+from edge.odometry.oak_child import EXIT_NO_DEVICE, EXIT_NO_PACKAGE, OFFLINE
 from edge.odometry.oak_record import Kind, PoseFlag, PoseRecord, Record, TextRecord
 from edge.odometry.source import (
     NS_PER_S,
@@ -223,6 +223,8 @@ class OakSource:
             reason += f", {self._what}"
         elif self._child.last_words:
             reason += f", {self._child.last_words[-200:]}"
+        if code == EXIT_NO_DEVICE:
+            reason += "; check its USB 3 cable and power, that nothing else uses it, and the udev rules of systemd/udev"
         self._drop_child()
         self._event("died", reason)
         if code == EXIT_NO_PACKAGE:

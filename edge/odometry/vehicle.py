@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.config import RigGeometry
 from edge.frames import Float64, Pose
-from edge.odometry.transforms import compose, multiply
+from edge.odometry.transforms import compose, inverse, multiply
 
 
 def rig_in_vehicle(geometry: RigGeometry) -> tuple[Float64, Float64]:
@@ -37,3 +37,18 @@ def rig_poses(vehicle_poses: Iterable[Pose], geometry: RigGeometry) -> Iterator[
     position_m, quaternion_xyzw = rig_in_vehicle(geometry)
     for pose in vehicle_poses:
         yield compose(pose, Pose(pose.t_ns, position_m, quaternion_xyzw))
+
+
+def in_vehicle(pose: Pose, rig: Pose, geometry: RigGeometry) -> Pose:
+    """A frame of the odometry frame as the vehicle sees it.
+
+    Args:
+        pose: of that frame in the odometry frame.
+        rig: of the rig in the odometry frame, at the instant that is asked about.
+        geometry: how the rig stands on the vehicle.
+    Returns:
+        Its pose in the vehicle frame (base_link), at the instant of ``rig``.
+    """
+    mounted = Pose(rig.t_ns, *rig_in_vehicle(geometry))
+    seen = Pose(rig.t_ns, pose.position_m, pose.quaternion_xyzw)
+    return compose(mounted, compose(inverse(rig), seen))
