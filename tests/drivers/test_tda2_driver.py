@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driver against emulated boards: whole captures, and every fault named within its time or cured by trying again."""
+"""The driver against emulated boards: whole captures; every fault is named within its time or cured by trying again."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from edge.frames import RADARS, Layout, RadarFrame, RadarId
 from edge.rig import Rig, load_rig
 from edge.sources.ti_capture import CaptureFolder
 from edge.waveform import Schedule
+from train.simulate.cascade_chip import ChipDelays
 from train.simulate.faults import Faults
 from train.simulate.rig import VirtualRig, VirtualRigSettings
 from train.simulate.tda2_board import Tda2Board, Tda2Settings
@@ -55,7 +56,7 @@ PATIENT = TimeOuts(
     frame_ended_s=SAFETY_S,
 )
 """A busy machine changes nothing."""
-SHORT = replace(PATIENT, connect_s=0.4, spi_s=0.4, answer_s=0.4, power_up_s=0.4, frame_ended_s=0.4, stop_record_s=0.4)
+SHORT = replace(PATIENT, connect_s=0.6, spi_s=0.6, answer_s=0.6, power_up_s=0.6, frame_ended_s=0.6, stop_record_s=0.6)
 """For faults that only a time-out shows."""
 
 
@@ -159,7 +160,7 @@ def test_two_boards_from_start_to_end(rig: Rig, tmp_path: Path, image: str) -> N
             notes = driver.configure(lambda *step: steps.append(step))
             assert len(notes) == 5
             assert "Virtual TDA2" in notes[0]
-            assert "slave3: master sub-system 2.2.2.0" in notes[4]
+            assert "slave3: master sub-system 2.2.2.0 patch 2.2.0.0" in notes[4]
             assert "calibrated (0x1ffe), 45 °C" in notes[4]
             assert driver.temperatures()["slave2"]["TX1"] == 45
         assert steps[0] == ("master: functional mode (master)", 0, steps[0][2])
@@ -231,17 +232,23 @@ def test_endless_frames_and_early_stop(make: Make) -> None:
     assert board.violations == []
 
 
-def test_external_trigger_without_a_report(make: Make, schedule: Schedule, tmp_path: Path, image: str) -> None:
+def test_external_trigger_without_a_report(
+    make: Make, schedule: Schedule, tmp_path: Path, image: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The master waits for pulses, so its report may come late: no error. Every pulse is a frame."""
     board, _ = make()
-    timeouts = replace(PATIENT, frame_started_s=SAFETY_S)
+    timeouts = replace(PATIENT, frame_started_s=0.5)
     driver = driver_for(board, replace(schedule, hardware_trigger=True), tmp_path, image, timeouts)
     configured(board, driver)
     driver.arm(2)
-    assert driver.start().frame_ready_ns is not None
-    board.pulse()
+    monkeypatch.setattr(board.chips[0], "_delays", ChipDelays(frame_ready_s=SAFETY_S))
+    assert driver.start().frame_ready_ns is None
+    while not driver.wait_ended(0.02):
+        board.pulse()
+    driver.stop()
     driver.close()
-    assert board.chips[0].frame is not None
-    assert board.chips[0].frame.trigger == 2
+    assert board.recorder.written == [2, 2, 2, 2]
+    assert board.violations == []
 
 
 def test_start_before_arm(make: Make) -> None:
@@ -253,36 +260,44 @@ def test_start_before_arm(make: Make) -> None:
 # --- what goes wrong: cured
 
 
-@pytest.mark.parametrize(
-    ("fault", "where", "options"),
-    [
-        ("split", "control", {"value": 3}),
-        ("delay", "control", {"share": 0.02, "value": 0.02}),
-        ("delay", "irq", {"share": 0.05, "value": 0.02}),
-        ("duplicate", "irq", {"share": 0.2}),
-        ("garble", "irq", {"times": 1, "skip": 60}),
-        ("truncate", "control", {"times": 1, "skip": 300}),
-        ("hang_up", "control", {"times": 1, "skip": 200}),
-        ("nack", "control", {"times": 1, "skip": 30}),
-        ("spi_nack", "spi", {"times": 2, "skip": 50}),
-    ],
-)
-def test_cured(make: Make, fault: str, where: str, options: dict[str, Any]) -> None:
+def test_clumsy_wire(make: Make) -> None:
+    """Pieces, delays, doubled interrupts and NACKs of chips need no second try."""
     faults = Faults(seed=1)
-    faults.set(fault, f"horizontal/{where}", **options)
+    faults.set("split", "horizontal/control", value=5)
+    faults.set("delay", "horizontal/control", share=0.01, value=0.01)
+    faults.set("delay", "horizontal/irq", share=0.02, value=0.01)
+    faults.set("duplicate", "horizontal/irq", share=0.1)
+    faults.set("spi_nack", "horizontal/spi", times=2, skip=50)
     board, driver = make(faults)
     notes = configured(board, driver)
-    assert sum(faults.struck.values())
+    assert len(faults.struck) == 5
+    assert min(faults.struck.values()) >= 1
+    assert "horizontal radar: 2 commands repeated after NACK" in notes
+    assert [opcode for opcode, _ in board.log].count(Opcode.DEVICE_RESET) == 4
     faults.clear()
     capture(driver, 2)
     assert board.recorder.written == [2, 2, 2, 2]
-    if fault in ("split", "delay"):
-        assert board.violations == []
-    if fault == "spi_nack":
-        assert "horizontal radar: 2 commands repeated after NACK" in notes
 
 
-@pytest.mark.parametrize(("where", "skip"), [("control", 100), ("irq", 60), ("irq", 0)])
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (("garble", "irq", {"skip": 5}), ("hang_up", "control", {"skip": 200})),
+        (("nack", "control", {"skip": 8}), ("truncate", "control", {"skip": 100})),
+    ],
+)
+def test_two_faults_and_a_third_try(make: Make, first: tuple[Any, ...], second: tuple[Any, ...]) -> None:
+    faults = Faults(seed=1)
+    for fault, where, options in (first, second):
+        faults.set(fault, f"horizontal/{where}", times=1, **options)
+    board, driver = make(faults, SHORT)
+    configured(board, driver)
+    assert sum(faults.struck.values()) == 2
+    capture(driver, 2)
+    assert board.recorder.written == [2, 2, 2, 2]
+
+
+@pytest.mark.parametrize(("where", "skip"), [("control", 100), ("irq", 0)])
 def test_one_lost_packet_is_cured_by_a_reset(make: Make, where: str, skip: int) -> None:
     faults = Faults(seed=1)
     faults.set("drop", f"horizontal/{where}", times=1, skip=skip)
@@ -354,7 +369,7 @@ def test_chip_that_never_answers(make: Make) -> None:
     faults.set("drop", "horizontal/irq")
     _, driver = make(faults, SHORT)
     driver.connect()
-    with pytest.raises(AnswerTimeoutError, match=r"master did not report POWERED_UP \(0x5000\) within 0.4 s \(3 tries"):
+    with pytest.raises(AnswerTimeoutError, match=r"master did not report POWERED_UP \(0x5000\) within 0.6 s \(3 tries"):
         driver.configure(silent_progress)
 
 
@@ -362,7 +377,7 @@ def test_board_that_answers_nothing(make: Make) -> None:
     faults = Faults(seed=1)
     faults.set("drop", "horizontal/control")
     _, driver = make(faults, SHORT)
-    with pytest.raises(AnswerTimeoutError, match=r"did not answer ping \(PING, board\) within 0.4 s"):
+    with pytest.raises(AnswerTimeoutError, match=r"did not answer ping \(PING, board\) within 0.6 s"):
         driver.connect()
 
 
@@ -414,12 +429,9 @@ def test_cable_pulled_while_frames_run(make: Make) -> None:
     driver.arm(0)
     driver.start()
     board.unplug(silent=True)
-    with pytest.raises(AnswerTimeoutError, match="slave3.*within 0.4 s"):
+    with pytest.raises(AnswerTimeoutError, match=r"slave3.*within"):
         driver.stop()
     driver.close()
-    board.plug()
-    configured(board, driver)
-    capture(driver, 2)
 
 
 def test_close_while_frames_run(make: Make) -> None:

@@ -168,6 +168,12 @@ def written(packet: Packet) -> bytes:
     return ack(packet) + interrupt(packet.device)
 
 
+def words(data: bytes) -> list:  # type: ignore[type-arg]
+    """Reactions to reads of four bytes each."""
+    parts = [data[k : k + 4] for k in range(0, len(data), 4)]
+    return [lambda p, d=d: board(Opcode.SPI_DATA, p.device, d, Opcode.SPI_READ) for d in parts]
+
+
 def test_command_and_answer() -> None:
     data, _, orders = run([written, *reading(GOOD)])
     assert data == bytes(8)
@@ -196,9 +202,20 @@ def test_answer_with_crc_16() -> None:
 
 def test_doubled_interrupt() -> None:
     """The second finds nothing to read and is passed over."""
-    silence = reading(b"", b"\xff" * 4)[:2]
-    data, chips, _ = run([written, *silence[:1], lambda p: silence[1](p) + interrupt(p.device), *reading(GOOD)])
+    *silence, last = words(b"\xff" * 4 * 32)
+    data, chips, _ = run([written, ack, *silence, lambda p: last(p) + interrupt(p.device), *reading(GOOD)])
     assert (data, chips.spurious) == (bytes(8), 1)
+
+
+@pytest.mark.parametrize("late", [1, 4, 6, 11])
+def test_sync_word_that_comes_late(late: int) -> None:
+    """A chip that is slow fills with FF; the message may begin between two words."""
+    begin = b"\xff" * late + bytes.fromhex("badccdab")
+    over = -len(begin) % 4
+    head = words(begin + GOOD[:over])
+    parts = (GOOD[over:12], GOOD[12:-4], GOOD[-4:])
+    reads = [lambda p, d=d: board(Opcode.SPI_DATA, p.device, d, Opcode.SPI_READ) for d in parts]
+    assert run([written, ack, *head, *reads])[0] == bytes(8)
 
 
 def test_event_before_the_answer() -> None:
@@ -241,28 +258,59 @@ def test_refusal_of_a_chip() -> None:
 
 
 @pytest.mark.parametrize(
-    ("message", "sync", "what"),
+    ("message", "what"),
     [
-        (GOOD, "badccdac", "wrong sync word"),
-        (GOOD[:2] + b"\x19" + GOOD[3:], "badccdab", "damaged message: header checksum"),
-        (GOOD[:-1] + bytes([GOOD[-1] ^ 0x10]), "badccdab", "damaged message: CRC"),
-        (chip_message(0x12, 0), "badccdab", "something else"),
+        (GOOD[:2] + b"\x19" + GOOD[3:], "damaged message: header checksum"),
+        (GOOD[:-1] + bytes([GOOD[-1] ^ 0x10]), "damaged message: CRC"),
+        (chip_message(0x12, 0), "something else"),
     ],
 )
-def test_damaged_answers(message: bytes, sync: str, what: str) -> None:
+def test_damaged_answers(message: bytes, what: str) -> None:
     with pytest.raises(ChipAnswerError, match=what):
-        run([written, *reading(message, bytes.fromhex(sync))])
+        run([written, *reading(message)])
 
 
-def test_fault_of_a_chip() -> None:
+def test_no_sync_word() -> None:
+    with pytest.raises(ChipAnswerError, match="no sync word"):
+        run([written, ack, *words(bytes.fromhex("badccdac") * 32)])
+
+
+def event_then(event: Event, data: bytes, *others: list) -> list:  # type: ignore[type-arg]
+    """An event in the place of an answer, then others, each with its interrupt."""
+    reactions = [written]
+    messages = [chip_message(0x280, 0, ((int(event), data),), kind=3, direction=6), *others]
+    for message in messages[:-1]:
+        *read, last = reading(message)
+        reactions += [*read, lambda p, last=last: last(p) + interrupt(p.device)]
+    return reactions + reading(messages[-1])
+
+
+def test_fault_of_a_running_chip() -> None:
     fault = chip_message(0x280, 0, ((int(Event.CPU_FAULT), bytes(32)),), kind=3, direction=6)
     with pytest.raises(ChipFaultError, match="master reports a CPU fault of the master sub-system"):
-        run([written, *reading(fault)])
+        run(event_then(Event.RADAR_POWERED_UP, bytes(32), fault))
+
+
+@pytest.mark.parametrize("event", [Event.CPU_FAULT, Event.ESM_FAULT, Event.BOOT_STATUS])
+def test_events_of_a_booting_chip(event: Event) -> None:
+    """The boot status follows every firmware image; first silicon also reports faults each time."""
+    data, chips, _ = run(event_then(event, b"\1" * 32, GOOD))
+    assert data == bytes(8)
+    assert chips.take(MASTER, event) is not None
 
 
 def test_chip_stays_silent() -> None:
     with pytest.raises(AnswerTimeoutError, match=r"horizontal radar, master did not answer version within 0.2 s"):
         run([ack], SHORT)
+
+
+def test_chip_that_never_stops_talking() -> None:
+    """Events without end in the place of an answer end the wait all the same."""
+    event = chip_message(0x80, 0, ((int(Event.FRAME_STARTED), bytes(4)),), kind=3)
+    *read, last = reading(event)
+    endless = [*read, lambda p: last(p) + interrupt(p.device)] * 5000
+    with pytest.raises(AnswerTimeoutError, match="did not answer version"):
+        run([written, *endless], SHORT)
 
 
 def test_lost_interrupt_and_lost_data() -> None:

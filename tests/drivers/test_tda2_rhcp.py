@@ -13,7 +13,7 @@ from edge.drivers.tda2.chips import ChipAnswerError, ChipFaultError
 from edge.drivers.tda2.crc import crc16, ones_complement
 from edge.drivers.tda2.packets import CHIPS, Opcode
 from edge.drivers.tda2.plan import command_packet, read_packets
-from edge.drivers.tda2.reports import check_calibration, temperatures, version_text
+from edge.drivers.tda2.reports import boot_note, check_calibration, temperatures, version_text
 from edge.drivers.tda2.rhcp import (
     READ_REQUEST,
     ChipMessage,
@@ -22,6 +22,7 @@ from edge.drivers.tda2.rhcp import (
     Event,
     Kind,
     encode,
+    fault_text,
     parse_header,
     parse_message,
     refusal_text,
@@ -173,8 +174,24 @@ def test_temperatures_and_versions() -> None:
     assert (got["RX0"], got["TX0"], got["DIG1"]) == (-2, 2, 7)
     with pytest.raises(ChipAnswerError, match="20 bytes"):
         temperatures("master", bytes(20))
-    assert version_text(bytes((1, 2, 2, 2, 2, 1, 7, 0))) == "2.2.1.7"
-    assert version_text(b"") == "unknown"
+    data = bytes((1, 1, 1, 2, 2, 1, 7, 20, 3, 17, 2, 2, 21, 8, 5, 0x1D))
+    assert version_text(data) == "2.2.1.7 patch 2.2.1.13"
+    assert version_text(data[:15]) == "unknown"
+
+
+def test_what_events_break() -> None:
+    """TI's host takes boot status and corrected errors for good news; so must this one."""
+    clean, group_2 = bytes(32), struct.pack("<2I", 0, 1 << 12)
+    assert fault_text(Event.BOOT_STATUS, b"\xff" * 32) == ""
+    assert fault_text(Event.FRAME_ENDED, b"\xff" * 32) == ""
+    assert "CPU fault of the radar" in fault_text(Event.RADAR_CPU_FAULT, clean)
+    assert fault_text(Event.RADAR_ESM_FAULT, struct.pack("<2I", 0xFFFF, 0)) == ""
+    assert "ESM group 2" in fault_text(Event.ESM_FAULT, group_2)
+    assert fault_text(Event.RADAR_ERROR, clean) == ""
+    assert "radar sub-system" in fault_text(Event.RADAR_ERROR, struct.pack("<2I", 3, 0))
+    assert "supply" in fault_text(Event.SUPPLY_FAULT, struct.pack("<2I", 1, 1))
+    assert boot_note("master", struct.pack("<IQQ", 999, 0, 0)) == ""
+    assert boot_note("master", struct.pack("<IQQ", 999, 1 << 30, 0)) == "master: boot status 0x40000000, 0 is good"
 
 
 def test_message_numbers_follow_from_sub_blocks() -> None:

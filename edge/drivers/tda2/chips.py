@@ -25,8 +25,8 @@ from edge.drivers.tda2.timeouts import NACK_TRIES, TimeOuts
 from edge.errors import DeviceError, LinkError, RefusalError
 
 _LOG = logging.getLogger(__name__)
-_SILENCE = (b"\xff" * 4, b"\0" * 4)
-"""What is read in place of a sync word when no message waits."""
+_SYNC_READS = 32
+"""Words in which the sync word must come; a chip that is late fills with FF before it (TI's host reads 1000 bytes)."""
 _EVENTS_KEPT = 64
 
 
@@ -105,10 +105,12 @@ class Chips:
         self._owner, self._link, self._timeouts = owner, link, timeouts
         self._sequence = dict.fromkeys(CHIPS, 0)
         self._events: dict[int, deque[ChipEvent]] = {device: deque(maxlen=_EVENTS_KEPT) for device in CHIPS}
+        self._running = dict.fromkeys(CHIPS, False)
 
     def forget(self, device: int) -> None:
         """The chip is reset: what it had to say is gone, sequence numbers begin anew."""
         self._sequence[device] = 0
+        self._running[device] = False
         self._events[device].clear()
         self._link.clear_interrupt(device)
 
@@ -210,23 +212,33 @@ class Chips:
     def _read(self, device: int, deadline_s: float) -> tuple[ChipMessage, int] | None:
         """The next message of a chip and when its interrupt came; None: none until the deadline."""
         while (t_ns := self._link.interrupt(device, deadline_s)) is not None:
+            if time.monotonic() > deadline_s + self._timeouts.spi_s:
+                return None  # a chip that never stops talking
             request = Packet(Opcode.SPI_WRITE, device, AckType.PROCESSED, rhcp.READ_REQUEST)
             self._link.order(request, Opcode.ACK, self._timeouts.spi_s, "read request")
             self._link.clear_interrupt(device)
             time.sleep(self._timeouts.after_request_s)
-            sync = self._spi_read(device, len(rhcp.CHIP_SYNC), "sync word")
-            if sync == rhcp.CHIP_SYNC:
-                return self._message(device), t_ns
-            if sync not in _SILENCE:
-                raise ChipAnswerError(
-                    f"{self._name(device)}: wrong sync word", value=sync.hex(), allowed=rhcp.CHIP_SYNC.hex()
-                )
+            begun = self._sync(device)
+            if begun is not None:
+                return self._message(device, begun), t_ns
             self.spurious += 1
         return None
 
-    def _message(self, device: int) -> ChipMessage:
+    def _sync(self, device: int) -> bytes | None:
+        """Find the sync word, as TI's host does; what was read after it, or None: the chip has nothing to say."""
+        read = b""
+        for _ in range(_SYNC_READS):
+            read += self._spi_read(device, len(rhcp.CHIP_SYNC), "sync word")
+            _, found, after = read.partition(rhcp.CHIP_SYNC)
+            if found:
+                return after
+        if read.strip(b"\xff") and read.strip(b"\0"):
+            raise ChipAnswerError(f"{self._name(device)}: no sync word", value=read.hex(), allowed=rhcp.CHIP_SYNC.hex())
+        return None
+
+    def _message(self, device: int, begun: bytes) -> ChipMessage:
         try:
-            header = rhcp.parse_header(self._spi_read(device, rhcp.HEADER_BYTES, "header"))
+            header = rhcp.parse_header(begun + self._spi_read(device, rhcp.HEADER_BYTES - len(begun), "header"))
             size = header.payload_bytes
             payload = self._spi_read(device, size, "payload") if size else b""
             crc = self._spi_read(device, header.crc_bytes, "CRC") if header.crc_bytes else b""
@@ -242,16 +254,25 @@ class Chips:
         return answer.data
 
     def _keep(self, device: int, message: ChipMessage, t_ns: int) -> None:
-        """Take in events; ChipFaultError when one says that the chip is at its end."""
+        """Take in events.
+
+        While a chip boots, faults are only logged: first silicon reports some each time (TI's host waits for them).
+
+        Raises:
+            ChipFaultError: the chip says that it is at its end.
+        """
         if message.header.kind != Kind.EVENT:
             _LOG.warning("%s: %s came unasked", self._name(device), message.header.raw.hex())
             return
         for block, data in message.blocks:
-            fault = {int(event): text for event, text in rhcp.FAULTS.items()}.get(block)
-            if fault is not None:
+            fault = rhcp.fault_text(block, data)
+            if fault and self._running[device]:
                 raise ChipFaultError(
                     f"{self._name(device)} reports a {fault} (event 0x{block:04x})",
                     value=data.hex(),
                     action="it is reset and configured anew; if it stays, check firmware image and supply",
                 )
+            if fault:
+                _LOG.warning("%s reports a %s while it boots: %s", self._name(device), fault, data.hex())
+            self._running[device] |= block == Event.RADAR_POWERED_UP
             self._events[device].append(ChipEvent(block, data, t_ns))

@@ -68,6 +68,15 @@ def temperatures(name: str, data: bytes) -> dict[str, int]:
     return dict(zip(TEMPERATURE_SENSORS, _TEMPERATURES.unpack_from(data)[1:], strict=True))
 
 
+def boot_note(name: str, data: bytes) -> str:
+    """What a chip's boot status says after the firmware image; "": all is well, or nothing came."""
+    status = int.from_bytes(data[4:12], "little")
+    return f"{name}: boot status 0x{status:x}, 0 is good" if status else ""
+
+
 def version_text(data: bytes) -> str:
-    """Version of a chip's firmware: bytes 3 to 6 of TI's structure, after the hardware's variant, major and minor."""
-    return ".".join(str(value) for value in data[3:7]) if len(data) >= 7 else "unknown"
+    """Version of a chip's firmware and of its patch (mmwavelink: 3 bytes of hardware, 7 of ROM, 6 of patch)."""
+    if len(data) < 16:
+        return "unknown"
+    patch = (data[10], data[11], data[15] >> 4, data[15] & 15)
+    return f"{'.'.join(map(str, data[3:7]))} patch {'.'.join(map(str, patch))}"

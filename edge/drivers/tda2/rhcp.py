@@ -63,19 +63,23 @@ class Event(IntEnum):
     RADAR_POWERED_UP = 0x5001
     CPU_FAULT = 0x5002
     ESM_FAULT = 0x5003
-    BOOT_ERROR = 0x5005
+    BOOT_STATUS = 0x5005
     RADAR_ERROR = 0x5008
+    SUPPLY_FAULT = 0x5009
 
 
-FAULTS = {
+_CPU_FAULTS = {
     Event.RADAR_CPU_FAULT: "CPU fault of the radar sub-system",
-    Event.RADAR_ESM_FAULT: "error signalled by the radar sub-system's monitors (ESM)",
     Event.CPU_FAULT: "CPU fault of the master sub-system",
-    Event.ESM_FAULT: "error signalled by the master sub-system's monitors (ESM)",
-    Event.BOOT_ERROR: "boot error",
-    Event.RADAR_ERROR: "error of the radar sub-system",
 }
-"""Events after which the chip must be reset."""
+_MONITOR_FAULTS = {
+    Event.RADAR_ESM_FAULT: "uncorrectable error of the radar sub-system (ESM group 2)",
+    Event.ESM_FAULT: "uncorrectable error of the master sub-system (ESM group 2)",
+}
+_STATUS_FAULTS = {
+    Event.RADAR_ERROR: "failure of the radar sub-system",
+    Event.SUPPLY_FAULT: "fault of its analogue supply",
+}
 
 REFUSALS = {
     1: "unknown message",
@@ -239,6 +243,20 @@ def parse_message(header: Header, payload: bytes, crc: bytes) -> ChipMessage:
         blocks.append((int.from_bytes(rest[:2], "little"), rest[4:size]))
         rest = rest[size:]
     return ChipMessage(header, tuple(blocks))
+
+
+def fault_text(block: int, data: bytes) -> str:
+    """What an event says is broken; "" when the chip works on.
+
+    Group 1 of the error signalling module (first word) holds corrected errors, group 2 (second word) the others; in
+    status events 0 is no fault (mmwavelink). BOOT_STATUS is no fault by itself: it follows every firmware image.
+    """
+    words = struct.unpack("<2I", data[:8].ljust(8, b"\0"))
+    for faults, broken in ((_CPU_FAULTS, True), (_MONITOR_FAULTS, words[1] != 0), (_STATUS_FAULTS, words[0] != 0)):
+        for event, text in faults.items():
+            if block == event and broken:
+                return text
+    return ""
 
 
 def refusal_text(code: int, block: int) -> str:
