@@ -61,6 +61,7 @@ class Message:
     topic: str
     log_time_ns: int
     payload: memoryview
+    sequence: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +116,12 @@ class McapFile:
             self.close()
             raise
 
-    def messages(self, report: ReadReport) -> Iterator[Message]:
+    def messages(self, report: ReadReport, span_ns: tuple[int, int] | None = None) -> Iterator[Message]:
         """Every readable message in the order of the file; ``report`` is filled on the way.
 
+        Args:
+            report: of this pass.
+            span_ns: chunks that end before the first or begin after the second instant are passed over unread.
         Raises:
             RecordingError: a compressed chunk, or the disk fails.
         """
@@ -126,13 +130,14 @@ class McapFile:
             if record.opcode == Opcode.DATA_END and record.length == DATA_END_BYTES:
                 break
             if record.opcode == Opcode.CHUNK:
-                yield from self._chunk_messages(record, channels, report)
+                if span_ns is None or self._within(record, *span_ns):
+                    yield from self._chunk_messages(record, channels, report)
             elif not record.whole:
                 report.bytes_lost += record.available
             elif record.opcode in (Opcode.CHANNEL, Opcode.MESSAGE) and record.length <= LARGEST_CHUNK:
                 head = RECORD.pack(record.opcode, record.length)
                 yield from self._inner(memoryview(head + self._read(record.offset, record.length)), channels, report)
-        if self.statistics is not None and self._fd >= 0:
+        if self.statistics is not None and self._fd >= 0 and span_ns is None:
             report.missing = max(0, self.statistics.message_count - report.messages)
 
     def close(self) -> None:
@@ -159,6 +164,14 @@ class McapFile:
             if opcode == Opcode.FOOTER:
                 return
             offset = body + length
+
+    def _within(self, record: _Record, first_ns: int, last_ns: int) -> bool:
+        """Whether a chunk's own times say that it touches the span."""
+        head = self._read(record.offset, CHUNK.size)
+        if len(head) < CHUNK.size:
+            return True
+        start_ns, end_ns, *_ = CHUNK.unpack(head)
+        return not (end_ns < first_ns or start_ns > last_ns)
 
     def _chunk_messages(self, record: _Record, channels: dict[int, str], report: ReadReport) -> Iterator[Message]:
         data = self._chunk_data(record) if record.whole else None
@@ -203,10 +216,11 @@ class McapFile:
                 if channel is not None:
                     channels.setdefault(channel.id, channel.topic)  # what the summary says has a CRC
             elif opcode == Opcode.MESSAGE and length >= MESSAGE.size:
-                channel_id, _, log_time_ns, _ = MESSAGE.unpack_from(data, body)
+                channel_id, sequence, log_time_ns, _ = MESSAGE.unpack_from(data, body)
                 if channel_id in channels:
                     report.messages += 1
-                    yield Message(channels[channel_id], log_time_ns, data[body + MESSAGE.size : body + length])
+                    payload = data[body + MESSAGE.size : body + length]
+                    yield Message(channels[channel_id], log_time_ns, payload, sequence)
             offset = body + length
         report.bytes_lost += len(data) - offset
 

@@ -73,8 +73,16 @@ class RecordingReader:
         Raises:
             RecordingError: a message that is whole but not what its topic says, or the disk fails.
         """
+        yield from self.items()
+
+    def items(self, span_ns: tuple[int, int] | None = None) -> Iterator[RadarFrame | Pose]:
+        """Frames and poses, or those whose log time lies in a span, its ends included; the rest is not even read.
+
+        Raises:
+            RecordingError: as iteration.
+        """
         layouts: dict[RadarId, Layout] = {}
-        for message in self._messages():
+        for message in self._messages(span_ns):
             if message.topic in _RADAR_OF_TOPIC:
                 frame = schema.decode_frame(message.payload)
                 if frame.radar != _RADAR_OF_TOPIC[message.topic]:
@@ -89,9 +97,9 @@ class RecordingReader:
             elif message.topic == schema.POSE_TOPIC:
                 yield schema.decode_pose(message.payload)
 
-    def results(self) -> Iterator[schema.RecordedMessage]:
-        """Published results, in the order they were recorded."""
-        for message in self._messages():
+    def results(self, span_ns: tuple[int, int] | None = None) -> Iterator[schema.RecordedMessage]:
+        """Published results, in the order they were recorded; ``span_ns`` as for ``items``."""
+        for message in self._messages(span_ns):
             if message.topic in schema.RESULT_TOPICS:
                 yield schema.RecordedMessage(message.topic, message.log_time_ns, bytes(message.payload))
 
@@ -165,10 +173,36 @@ class RecordingReader:
     ) -> None:
         self.close()
 
-    def _messages(self) -> Iterator[Message]:
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time; reads a truncated file once to know."""
+        return self._contents()[1]
+
+    def frames_of(self, radar: RadarId) -> int:
+        """Raw frames of one radar; reads a truncated file once to know."""
+        return self._contents()[0].get(schema.FRAME_TOPICS[radar], 0)
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether there is any raw frame; results alone cannot go through the pipeline."""
+        return self.total_frames > 0
+
+    @property
+    def has_results(self) -> bool:
+        """Whether there is any published result."""
+        counts, _ = self._contents()
+        return any(counts.get(topic, 0) for topic in schema.RESULT_TOPICS)
+
+    def messages(self, span_ns: tuple[int, int] | None = None) -> Iterator[Message]:
+        """Everything readable, undecoded; a message's payload is valid until the next one is asked for."""
+        return self._messages(span_ns)
+
+    def _messages(self, span_ns: tuple[int, int] | None = None) -> Iterator[Message]:
         self.report = ReadReport()
         try:
-            yield from self._mcap.messages(self.report)
+            for message in self._mcap.messages(self.report, span_ns):
+                if span_ns is None or span_ns[0] <= message.log_time_ns <= span_ns[1]:
+                    yield message
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be read", value=error.strerror) from error
 

@@ -29,8 +29,19 @@ CALIBRATION_PREFIX = "calibration/"
 
 FRAME_TOPICS: dict[RadarId, str] = {radar: f"/radar/{radar}/raw" for radar in RADARS}
 POSE_TOPIC = "/pose"
-RESULT_TOPICS = ("/shape", "/cloud", "/detections", "/heatmap", "/status")
-"""Results are stored as the stream encodes them."""
+RESULT_TOPIC_OF = {
+    "shape": "/shape",
+    "cloud": "/cloud",
+    "det": "/detections",
+    "heat": "/heatmap",
+    "status": "/status",
+    "pose": "/rig_pose",
+    "hb": "/heartbeat",
+}
+"""Name in the topic of the stream (``1/shape/car/``) -> topic in the recording."""
+OTHER_TOPIC = "/other"
+RESULT_TOPICS = (*RESULT_TOPIC_OF.values(), OTHER_TOPIC)
+"""Results are stored as the stream encodes them, with their own topic, in the single-frame form."""
 
 FRAME_SCHEMA, FRAME_ENCODING = "rfconstruct.RawFrame.v1", "x-rfconstruct-frame"
 RESULT_SCHEMA, RESULT_ENCODING = "rfconstruct.Stream.v1", "x-rfconstruct-stream"
@@ -73,6 +84,12 @@ class RecordedMessage:
     topic: str
     t_ns: int
     payload: bytes
+
+
+def result_topic(stream_topic: bytes) -> str:
+    """Where a message of the stream is stored."""
+    parts = stream_topic.split(b"/")
+    return RESULT_TOPIC_OF.get(parts[1].decode("ascii", "replace") if len(parts) > 1 else "", OTHER_TOPIC)
 
 
 def frame_header(frame: RadarFrame) -> bytes:

@@ -16,10 +16,12 @@ from types import TracebackType
 
 from edge.calibration import Calibration, Waveform, save_calibration
 from edge.errors import RecordingError
-from edge.frames import Pose, RadarFrame, RadarId
+from edge.frames import Pose, RadarFrame
 from edge.recording import schema
+from edge.recording.head import LIBRARY, write_head
 from edge.recording.mcap_writing import AppendFile, McapWriter
 from edge.rig import Radar, Rig
+from edge.stream.wire import join
 
 FLUSH_PERIOD_S = 0.5
 """What waits in memory is written and the file is synchronised this often."""
@@ -35,16 +37,16 @@ class RecordingWriter:
 
     Args:
         path: must not exist; the folder must.
-        rig: its folder and calibrations are stored with the data.
+        rig: its folder and calibrations are stored with the data; None: results only, no frames.
         notes: what a reader of the data should know, in sentences; stored, and shown by a replay.
     Raises:
         RecordingError: the file exists or cannot be written; the disk is full, now or in any later call. What was
             written before stays readable.
     """
 
-    def __init__(self, path: Path | str, rig: Rig, notes: Sequence[str] = ()) -> None:
+    def __init__(self, path: Path | str, rig: Rig | None, notes: Sequence[str] = ()) -> None:
         self.path, self.rig, self._notes = Path(path), rig, list(notes)
-        self._layouts = {radar: one.schedule.layout for radar, one in rig.radars.items()}
+        self._layouts = {} if rig is None else {radar: one.schedule.layout for radar, one in rig.radars.items()}
         self._lock = threading.Lock()
         self._failure = ""
         self._dirty, self._stop = False, threading.Event()
@@ -58,8 +60,8 @@ class RecordingWriter:
                 action="choose another name: recordings are never overwritten" if exists else "check the folder",
             ) from error
         try:
-            self._writer = McapWriter(self._file, schema.PROFILE, "rfconstruct")
-            self._frame_channel, self._pose_channel, self._result_channel = self._head()
+            self._writer = McapWriter(self._file, schema.PROFILE, LIBRARY)
+            self._channels = write_head(self._writer, self._metadata(), _attachments(rig), list(self._layouts))
         except (OSError, RecordingError) as error:
             self._file.close()
             self.path.unlink(missing_ok=True)
@@ -73,28 +75,38 @@ class RecordingWriter:
         """Append a raw frame; RecordingError when the rig has no such radar or layout."""
         if self._layouts.get(frame.radar) != frame.layout:
             raise RecordingError(
-                f"{frame.radar} frame {frame.number} contradicts rig {self.rig.name}",
+                f"{frame.radar} frame {frame.number} contradicts rig {self.rig.name if self.rig else '(none)'}",
                 value=frame.layout,
                 allowed=str(self._layouts.get(frame.radar, "no such radar")),
                 action="record with the rig that the frames come from",
             )
         parts = (schema.frame_header(frame), frame.adc.reshape(-1).data.cast("B"))
-        channel, sequence = self._frame_channel[frame.radar], frame.number & 0xFFFFFFFF
+        channel, sequence = self._channels[schema.FRAME_TOPICS[frame.radar]], frame.number & 0xFFFFFFFF
         t_ns = _recordable(frame.t_first_chirp_ns)
         self._append(lambda: self._writer.write_message(channel, t_ns, parts, sequence))
 
     def pose(self, pose: Pose) -> None:
         """Append a pose."""
         t_ns, payload = _recordable(pose.t_ns), schema.encode_pose(pose)
-        self._append(lambda: self._writer.add_message(self._pose_channel, t_ns, payload))
+        self._append(lambda: self._writer.add_message(self._channels[schema.POSE_TOPIC], t_ns, payload))
 
     def message(self, topic: str, payload: bytes, t_ns: int) -> None:
         """Append a result as the stream encodes it; RecordingError for a topic that is not in RESULT_TOPICS."""
-        channel = self._result_channel.get(topic)
-        if channel is None:
+        if topic not in schema.RESULT_TOPICS:
             raise RecordingError("topic of no result", value=topic, allowed=", ".join(schema.RESULT_TOPICS))
+        channel = self._channels[topic]
         t_ns = _recordable(t_ns)
         self._append(lambda: self._writer.add_message(channel, t_ns, payload))
+
+    def published(self, frames: Sequence[bytes], t_ns: int) -> None:
+        """Append a message of the stream as it came (topic, header, payloads), under the topic of its kind.
+
+        Args:
+            frames: as received or as ``Publisher`` returned them; no frames, no message.
+            t_ns: when it came.
+        """
+        if frames:
+            self.message(schema.result_topic(frames[0]), join(frames), t_ns)
 
     def flush(self) -> None:
         """Write what waits in memory: what was appended so far survives the death of this process."""
@@ -124,35 +136,16 @@ class RecordingWriter:
     ) -> None:
         self.close()
 
-    def _head(self) -> tuple[dict[RadarId, int], int, dict[str, int]]:
-        """Everything that must be in the file before the first frame."""
-        writer = self._writer
-        writer.add_metadata(
-            schema.METADATA,
-            {
-                "format_version": str(schema.FORMAT_VERSION),
-                "rig": self.rig.name,
-                "config_hash": self.rig.config_hash.hex(),
-                "host": platform.node(),
-                "utc_minus_monotonic_ns": str(time.time_ns() - time.monotonic_ns()),
-                "notes": json.dumps(self._notes),
-            },
-        )
-        for name, content in _attachments(self.rig).items():
-            writer.add_attachment(name, "application/octet-stream", content)
-        description = (schema.__doc__ or "").encode()
-        frame_schema = writer.add_schema(schema.FRAME_SCHEMA, "x-text", description)
-        pose_schema = writer.add_schema(schema.POSE_SCHEMA, "jsonschema", schema.POSE_JSON_SCHEMA)
-        result_schema = writer.add_schema(schema.RESULT_SCHEMA, "", b"")
-        frames: dict[RadarId, int] = {
-            radar: writer.add_channel(schema.FRAME_TOPICS[radar], schema.FRAME_ENCODING, frame_schema)
-            for radar in self._layouts
+    def _metadata(self) -> dict[str, str]:
+        rig = self.rig
+        return {
+            "format_version": str(schema.FORMAT_VERSION),
+            "rig": rig.name if rig is not None else "",
+            "config_hash": rig.config_hash.hex() if rig is not None else "",
+            "host": platform.node(),
+            "utc_minus_monotonic_ns": str(time.time_ns() - time.monotonic_ns()),
+            "notes": json.dumps(self._notes),
         }
-        pose = writer.add_channel(schema.POSE_TOPIC, schema.POSE_ENCODING, pose_schema)
-        results = {
-            topic: writer.add_channel(topic, schema.RESULT_ENCODING, result_schema) for topic in schema.RESULT_TOPICS
-        }
-        return frames, pose, results
 
     def _append(self, action: Callable[[], None]) -> None:
         with self._lock:
@@ -207,9 +200,11 @@ def _recordable(t_ns: int) -> int:
     return t_ns
 
 
-def _attachments(rig: Rig) -> dict[str, bytes]:
+def _attachments(rig: Rig | None) -> dict[str, bytes]:
     """The rig's texts and the calibrations in use, by name in the recording."""
     found: dict[str, bytes] = {}
+    if rig is None:
+        return found
     try:
         for path in sorted(rig.directory.iterdir()):
             if path.is_file() and path.suffix in TEXT_SUFFIXES:

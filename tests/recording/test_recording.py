@@ -70,7 +70,7 @@ def test_the_mcap_projects_readers_agree(tmp_path: Path, layout: Layout, make: A
             assert stored.name == "foxglove.PoseInFrame"
             assert json.loads(message.data)["pose"]["position"]["y"] == 1 / 3
     statistics = opened().get_summary().statistics
-    assert (statistics.message_count, statistics.schema_count, statistics.channel_count) == (20, 3, 8)
+    assert (statistics.message_count, statistics.schema_count, statistics.channel_count) == (20, 3, 11)
     assert statistics.message_start_time == 10**9
     assert [a.name for a in opened().iter_attachments()] == ["rig/rig.toml"]
 
