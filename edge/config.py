@@ -283,15 +283,20 @@ class StreamSettings:
     """Where results are published.
 
     Args:
-        endpoints: ZeroMQ addresses to bind; only ipc:// and loopback are accepted.
+        endpoints: ZeroMQ addresses to bind: ipc:// and loopback; with ``key_folder`` others too, under CURVE.
         send_high_water_mark: messages queued per subscriber before the newest are dropped for it; a window and
             its shapes leave in one burst, and a queue of 4 drops some of it even for a subscriber that keeps up.
         shape_encoding: number format of a shape's points: f4, f2 (0.5 mm within 2 m) or i2 (0.5 mm within 32 m).
+        latest_endpoints: addresses, of the same kind, of single-frame messages for subscribers that want only the
+            newest (ZMQ_CONFLATE).
+        key_folder: keys of the appliance and of the clients that may come in (``rfconstruct keys``); "": none.
     """
 
     endpoints: tuple[str, ...] = ("tcp://127.0.0.1:5600",)
     send_high_water_mark: int = 32
     shape_encoding: PointEncoding = "f4"
+    latest_endpoints: tuple[str, ...] = ()
+    key_folder: str = ""
 
     def __post_init__(self) -> None:
         require(len(self.endpoints) > 0, "stream.endpoints", self.endpoints, "at least one address")

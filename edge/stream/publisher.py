@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes results on a ZeroMQ PUB socket; a subscriber that is slow, stuck or hostile never holds it up."""
+"""Publishes results over ZeroMQ; a subscriber that is slow, stuck or hostile never holds it up.
+
+One socket serves this machine. Another serves other machines, with CURVE and an authenticator, and lets nobody in when
+that dies. A third gives single-frame messages to those who want only the newest.
+"""
 
 from __future__ import annotations
 
 import ctypes
-import ipaddress
 import os
-import re
-import socket
 import threading
 import time
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -19,9 +22,14 @@ from edge.config import StreamSettings
 from edge.errors import ConfigError
 from edge.frames import Detections, FusedCloud, Heatmap, PointCloud, Pose, Shape
 from edge.stream import convert
+from edge.stream.addresses import checked_endpoint, is_local
+from edge.stream.authenticator import Authenticator
+from edge.stream.keys import KeyFolder
 from edge.stream.messages import State, Status
+from edge.stream.outlet import Outlet
 from edge.stream.wire import (
     BOOT_BYTES,
+    FLAG_REPEATED,
     HASH_BYTES,
     HEARTBEAT_HZ,
     HEATMAP_HZ,
@@ -30,15 +38,16 @@ from edge.stream.wire import (
     Draft,
     Source,
     Stamp,
+    conflatable,
     pack,
 )
 
-LINGER_MS = 500
-"""How long ``close`` waits for subscribers to take the last messages."""
-SEND_BUFFER_BYTES = 256 * 2**10
-INCOMING_LIMIT_BYTES = 64 * 2**10
-HEARTBEAT_MS, PEER_TIMEOUT_MS, HANDSHAKE_MS = 1000, 3000, 2000
-IPC_PATH_LIMIT = 107
+KEPT_TYPES = ("status", "shape")
+"""The last message of every topic of these types is kept for those who subscribe later."""
+REPEAT_HZ = 5.0
+"""A kept message is repeated so often at most, however many subscribe: subscribing must not flood others."""
+LATEST_HIGH_WATER_MARK = 4
+AUTHENTICATOR_DIED = "authenticator died: closed to other machines until the service is started again"
 _LIBC = ctypes.CDLL(None)
 _TIME_ERROR = 5  # ntp_gettime(3): the clock is not synchronised
 
@@ -49,11 +58,12 @@ class Publisher:
     Every sending method returns the frames it sent (``wire.join`` makes one block for a recording of them).
 
     Args:
-        settings: addresses to bind and queue length.
+        settings: addresses to bind, queue length, keys.
         config_hash, calibration_hash: hashes of what produces the data; the first 8 bytes are sent.
         source: "live", "replay" or "sim".
     Raises:
-        ConfigError: an address is in use, cannot be bound, or is reachable from other machines.
+        ConfigError: an address is in use, cannot be bound, or is reachable from other machines and there are no
+            proper keys.
     """
 
     def __init__(
@@ -69,17 +79,60 @@ class Publisher:
         self._sequence: dict[str, int] = {}
         self._paces: dict[str, _Pace] = {}
         self._summary: tuple[object, ...] = ()
+        self._kept: dict[str, Draft] = {}
+        self._newest: dict[str, bytes] = {}
+        self._asked: set[str] = set()
         self._lock = threading.Lock()
-        addresses = [checked_endpoint(endpoint) for endpoint in settings.endpoints]
+        self.fault = ""
+        """Why part of the stream is closed; empty while all is well."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = _pub_socket(self._context, settings.send_high_water_mark)
-        self.endpoints: tuple[str, ...] = ()
-        """Addresses that are bound; a port that was given as * is a number here."""
+        self._outlets: list[Outlet] = []
+        self._latest: list[Outlet] = []
+        self._guarded: list[Outlet] = []
+        self._authenticator: Authenticator | None = None
         try:
-            self.endpoints = tuple(_bind(self._socket, address) for address in addresses)
-        except ConfigError:
+            self._open(settings)
+        except BaseException:
             self.close()
             raise
+
+    def _open(self, settings: StreamSettings) -> None:
+        """Bind all addresses; those that other machines reach on sockets of their own, with keys."""
+        encrypted = bool(settings.key_folder)
+        kinds = (
+            ("stream.endpoints", settings.endpoints, self._outlets, settings.send_high_water_mark),
+            ("stream.latest_endpoints", settings.latest_endpoints, self._latest, LATEST_HIGH_WATER_MARK),
+        )
+        checked = [[checked_endpoint(e, encrypted, setting) for e in given] for setting, given, _, _ in kinds]
+        keys, to_bind = KeyFolder(Path(settings.key_folder)), []
+        for (setting, _, outlets, high_water_mark), addresses in zip(kinds, checked, strict=True):
+            for local in (True, False):
+                chosen = [address for address in addresses if is_local(address) is local]
+                if chosen:
+                    outlet = Outlet(self._context, high_water_mark, None if local else keys.server())
+                    outlets.append(outlet)
+                    self._guarded += [] if local else [outlet]
+                    to_bind.append((outlet, chosen, setting))
+        if self._guarded:
+            guarded = [outlet.socket for outlet in self._guarded]
+            self._authenticator = Authenticator(self._context, guarded, keys.allowed)
+        for outlet, addresses, setting in to_bind:
+            outlet.bind(addresses, setting)
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Addresses that are bound, in the order of local and other ones; a port given as * is a number here."""
+        return tuple(address for outlet in self._outlets for address in outlet.endpoints)
+
+    @property
+    def latest_endpoints(self) -> tuple[str, ...]:
+        """The same, of the single-frame messages."""
+        return tuple(address for outlet in self._latest for address in outlet.endpoints)
+
+    @property
+    def auth_failures(self) -> int:
+        """Handshakes from other machines that failed since the start: wrong key, no key, no ZeroMQ."""
+        return self._authenticator.failures if self._authenticator is not None else 0
 
     def shape(self, shape: Shape) -> list[bytes]:
         """Send a completed object. WireError: points that are not finite or do not fit the encoding."""
@@ -117,14 +170,19 @@ class Publisher:
         return self._send(convert.encode_status(status, now_ns))
 
     def heartbeat(self, state: State = "RUN") -> list[bytes]:
-        """Send a sign of life, ten a second at most: call it as often as convenient."""
+        """Send a sign of life, ten a second at most: call it as often as convenient. Serves new subscribers too."""
         now_ns = time.monotonic_ns()
+        with self._lock:
+            self._serve()
         return self._send(convert.encode_heartbeat(state, now_ns)) if self._due("hb", HEARTBEAT_HZ, now_ns) else []
 
     def close(self) -> None:
         """Give subscribers half a second to take the last messages, then release the addresses."""
         with self._lock:
-            self._socket.close(linger=LINGER_MS)
+            for outlet in (*self._outlets, *self._latest):
+                outlet.close()
+            if self._authenticator is not None:
+                self._authenticator.stop()
             self._context.term()
 
     def __enter__(self) -> Publisher:
@@ -141,20 +199,45 @@ class Publisher:
 
     def _send(self, draft: Draft) -> list[bytes]:
         with self._lock:
-            sequence = self._sequence.get(draft.topic, 0)
-            stamp = Stamp(
-                self._boot,
-                sequence,
-                time.monotonic_ns(),
-                time.time_ns(),
-                clock_synchronised(),
-                self._source,
-                *self._hashes,
-            )
-            frames = pack(draft, stamp)
-            self._sequence[draft.topic] = sequence + 1
-            self._socket.send_multipart(frames, zmq.DONTWAIT)
+            frames = self._emit(draft)
+            if draft.type in KEPT_TYPES:
+                self._kept[draft.topic] = replace(draft, flags=draft.flags | FLAG_REPEATED)
+                self._asked.discard(draft.topic)
+            if self._latest:
+                self._newest[draft.topic] = block = conflatable(frames)
+                for outlet in self._latest:
+                    outlet.send([block])
+            self._serve()
         return frames
+
+    def _emit(self, draft: Draft) -> list[bytes]:
+        """Stamp and send to all subscribers; the lock is held."""
+        sequence = self._sequence.get(draft.topic, 0)
+        times = time.monotonic_ns(), time.time_ns(), clock_synchronised()
+        frames = pack(draft, Stamp(self._boot, sequence, *times, self._source, *self._hashes))
+        self._sequence[draft.topic] = sequence + 1
+        for outlet in self._outlets:
+            outlet.send(frames)
+        return frames
+
+    def _serve(self) -> None:
+        """Give new subscribers what is kept, and close what is no longer guarded; the lock is held."""
+        if self._authenticator is not None and not self._authenticator.alive and not self.fault:
+            self.fault = AUTHENTICATOR_DIED
+            for outlet in self._guarded:
+                outlet.close()
+            self._outlets = [outlet for outlet in self._outlets if outlet not in self._guarded]
+            self._latest = [outlet for outlet in self._latest if outlet not in self._guarded]
+        for outlet in self._outlets:
+            self._asked.update(_matching(self._kept, outlet.subscriptions()))
+        for outlet in self._latest:
+            for topic in _matching(self._newest, outlet.subscriptions()):
+                outlet.send([self._newest[topic]])
+        now_ns = time.monotonic_ns()
+        for topic in sorted(self._asked):
+            if self._paces.setdefault(f"again {topic}", _Pace(REPEAT_HZ)).due(now_ns):
+                self._asked.discard(topic)
+                self._emit(self._kept[topic])
 
 
 class _Pace:
@@ -183,81 +266,7 @@ def clock_synchronised() -> bool:
     return int(_LIBC.ntp_gettime(ctypes.create_string_buffer(256))) in range(_TIME_ERROR)
 
 
-def checked_endpoint(endpoint: str) -> str:
-    """The address to bind, if only this machine can reach it.
-
-    Args:
-        endpoint: ``tcp://127.0.0.1:5600``, ``tcp://[::1]:5600``, ``tcp://localhost:5600`` or ``ipc:///run/name``.
-    Returns:
-        The same; localhost as a number.
-    Raises:
-        ConfigError: another transport, or a host that is not this machine's loopback.
-    """
-    match = re.fullmatch(r"tcp://(\[[^\]]+\]|[^:\[\]]+):(\*|\d{1,5})", endpoint)
-    if match is not None and (match[2] == "*" or int(match[2]) <= 65535):
-        host = "127.0.0.1" if match[1] == "localhost" else match[1].strip("[]")
-        try:
-            if ipaddress.ip_address(host).is_loopback:
-                return endpoint.replace("localhost", "127.0.0.1")
-        except ValueError:
-            pass
-    path = endpoint.removeprefix("ipc://")
-    if path != endpoint and 0 < len(os.fsencode(path)) <= IPC_PATH_LIMIT:
-        return endpoint
-    raise ConfigError(
-        "setting stream.endpoints: address cannot be used",
-        value=endpoint,
-        allowed="tcp://127.0.0.1:PORT, tcp://[::1]:PORT, ipc:///PATH (up to 107 bytes)",
-        action="other machines may not subscribe: the stream is not encrypted",
-    )
-
-
-def _pub_socket(context: zmq.Context[zmq.Socket[bytes]], high_water_mark: int) -> zmq.Socket[bytes]:
-    """A PUB socket with bounded queues, heartbeats and a short handshake."""
-    sender = context.socket(zmq.PUB)
-    for option, value in (
-        (zmq.SNDHWM, high_water_mark),
-        (zmq.SNDBUF, SEND_BUFFER_BYTES),
-        (zmq.MAXMSGSIZE, INCOMING_LIMIT_BYTES),
-        (zmq.HEARTBEAT_IVL, HEARTBEAT_MS),
-        (zmq.HEARTBEAT_TIMEOUT, PEER_TIMEOUT_MS),
-        (zmq.HANDSHAKE_IVL, HANDSHAKE_MS),
-        (zmq.TCP_KEEPALIVE, 1),
-    ):
-        sender.setsockopt(option, value)
-    return sender
-
-
-def _bind(sender: zmq.Socket[bytes], endpoint: str) -> str:
-    """Bind and return the actual address; one that someone else serves, or a file that is no socket, is refused."""
-    path = Path(endpoint.removeprefix("ipc://"))
-    if endpoint.startswith("ipc:///") and path.exists() and not path.is_socket():
-        raise ConfigError(
-            "setting stream.endpoints: there is a file of this name, and it is no socket",
-            value=endpoint,
-            action="set another address: binding would delete the file",
-        )
-    try:
-        if endpoint.startswith("ipc://") and _is_served(endpoint.removeprefix("ipc://")):
-            raise zmq.ZMQError(zmq.EADDRINUSE)
-        sender.setsockopt(zmq.IPV6, int("[" in endpoint))
-        sender.bind(endpoint)
-    except zmq.ZMQError as error:
-        raise ConfigError(
-            f"setting stream.endpoints: address cannot be bound ({zmq.strerror(error.errno or 0)})",
-            value=endpoint,
-            action="stop the other publisher or set another address"
-            if error.errno == zmq.EADDRINUSE
-            else "check that the address and its folder exist and may be used",
-        ) from error
-    return sender.getsockopt_string(zmq.LAST_ENDPOINT)
-
-
-def _is_served(path: str) -> bool:
-    """Whether someone listens at a Unix socket: ZeroMQ would take the path away from them without a word."""
-    with socket.socket(socket.AF_UNIX) as probe:
-        try:
-            probe.connect(("\0" + path[1:]) if path.startswith("@") else path)
-        except OSError:
-            return False
-    return True
+def _matching(kept: Iterable[str], prefixes: Sequence[bytes]) -> list[str]:
+    """Topics that a subscription to any of the prefixes selects."""
+    starts = tuple(prefix.decode("ascii", "replace") for prefix in prefixes)
+    return [topic for topic in kept if topic.startswith(starts)]

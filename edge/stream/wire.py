@@ -35,6 +35,8 @@ FLAG_CUT_WINDOW = 1
 """Time, a pose gap or the end of the data closed the window before it covered its travel."""
 FLAG_FEW_FRAMES = 2
 """The window holds fewer than 60 frames."""
+FLAG_REPEATED = 8
+"""Published before; sent again because somebody subscribed."""
 
 HEARTBEAT_HZ = 10.0
 HEATMAP_HZ = 10.0
@@ -201,6 +203,29 @@ def split(block: bytes) -> list[bytes]:
     for length in lengths:
         frames.append(block[start : start + length])
         start += length
+    return frames
+
+
+def conflatable(frames: Sequence[bytes]) -> bytes:
+    """A message of one frame that a subscriber still selects by its topic: the topic, then the single-frame form.
+
+    Args:
+        frames: of ``pack``.
+    Returns:
+        One block; ``split_conflatable`` undoes it.
+    """
+    return frames[0] + join(frames)
+
+
+def split_conflatable(block: bytes) -> list[bytes]:
+    """The frames of a message of ``conflatable``; WireError when it is none.
+
+    No byte of a topic is below 0x20 and the first byte of the single-frame form always is, so the topic ends there.
+    """
+    end = next((i for i, byte in enumerate(block[: TOPIC_LIMIT_BYTES + 1]) if byte < 0x20), None)
+    frames = split(block[end:]) if end is not None else []
+    if not frames or frames[0] != block[:end]:
+        raise WireError("conflatable message: topic and content do not match", value=block[:TOPIC_LIMIT_BYTES])
     return frames
 
 

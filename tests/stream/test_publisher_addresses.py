@@ -13,7 +13,8 @@ from stream_sockets import LOCAL, poses, publisher, subscribed
 
 from edge.config import StreamSettings
 from edge.errors import ConfigError, ExitCode
-from edge.stream.publisher import Publisher, checked_endpoint
+from edge.stream.addresses import checked_endpoint
+from edge.stream.publisher import Publisher
 
 
 @pytest.mark.parametrize(
