@@ -42,6 +42,7 @@ DEFAULT_GRAPH = "edge.odometry.oak_graph:build"
 
 EXIT_NO_PACKAGE, EXIT_NO_DEVICE, EXIT_ENDED, EXIT_FAULT = 10, 11, 12, 13
 """depthai is not installed; no camera, or it cannot be opened; its pipeline ended; anything else."""
+ENDED = "the camera's pipeline ended: unplugged, or the device failed"
 STOP_LIMIT_S = 3
 """The library's stop may hang; SIGALRM then ends the process."""
 WAIT_S = 0.05
@@ -213,6 +214,8 @@ def _run(args: argparse.Namespace, sender: Sender) -> int:
     graph.pipeline.start()
     try:
         code = _pump(graph, sender)
+    except depthai.MessageQueue.QueueException:
+        code = _failed(sender, EXIT_ENDED, ENDED)
     finally:
         signal.alarm(STOP_LIMIT_S)
         graph.pipeline.stop()  # without stop and wait the library aborts
@@ -242,7 +245,7 @@ def _pump(graph: Graph, sender: Sender) -> int:
                 sender.skip()  # several came at once: only the newest is of about now
             else:
                 sender.pose(message, flags, t_ns, arrival_ns, rate.fastest(arrival_ns))
-    return _failed(sender, EXIT_ENDED, "the camera's pipeline ended: unplugged, or the device failed")
+    return _failed(sender, EXIT_ENDED, ENDED)
 
 
 def pose_time(own_ns: int, frame_ns: int, arrival_ns: int, exact_frame: bool) -> tuple[int, PoseFlag]:

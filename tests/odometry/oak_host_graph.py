@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import threading
 import time
 from datetime import timedelta
 from typing import Any
@@ -30,7 +31,7 @@ def pose_at(number: int) -> tuple[tuple[float, float, float], tuple[float, float
 
 
 def build(dai: Any, args: argparse.Namespace) -> Graph:
-    """A host-only pipeline; the variable OAK_TEST_MODE: "frames" (default), "timed", "bare", "abort"."""
+    """A host-only pipeline; the variable OAK_TEST_MODE: "frames" (default), "timed", "bare", "abort", "lost"."""
     mode = os.environ.get("OAK_TEST_MODE", "frames")
 
     class Source(dai.node.ThreadedHostNode):  # type: ignore[misc]
@@ -56,6 +57,8 @@ def build(dai: Any, args: argparse.Namespace) -> Graph:
                 number += 1
                 if mode == "abort" and number == 20:
                     os.abort()
+                if mode == "lost" and number == 20:
+                    threading.Thread(target=pipeline.stop).start()
                 time.sleep(1 / RATE_HZ)
 
     pipeline = dai.Pipeline(False)

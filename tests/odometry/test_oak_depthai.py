@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from pose_collecting import collect
 from edge.board_settings import PoseSettings
 from edge.config import RigGeometry
 from edge.odometry.oak import OakSource
-from edge.odometry.oak_child import EXIT_NO_DEVICE, GRAPH_VARIABLE, OFFLINE
+from edge.odometry.oak_child import EXIT_ENDED, EXIT_NO_DEVICE, GRAPH_VARIABLE, OFFLINE
 from edge.odometry.oak_record import Kind, PoseFlag, PoseRecord, RecordReader, TextRecord
 
 ROOT = Path(__file__).parents[2]
@@ -118,6 +119,37 @@ def test_each_pose_has_its_frames_time_and_the_process_stops_cleanly() -> None:
     assert len(exact) > 0.8 * len(poses)  # the rest: the node was interrupted between pose and frame
     leads_ns = sorted(pose.arrival_ns - pose.t_ns for pose in exact)
     assert leads_ns[0] >= FRAME_LEAD_S * NS - 1000
+
+
+def test_a_lost_camera_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OAK_TEST_MODE", "lost")
+    code, data, text = run_child(seconds=60.0)
+    records = RecordReader().feed(data)
+    assert code == EXIT_ENDED, text
+    assert isinstance(records[-1], TextRecord)
+    assert "pipeline ended" in records[-1].text
+
+
+def test_the_child_ends_when_its_parent_is_killed() -> None:
+    """Nothing holds the camera after a kill -9 of the main process."""
+    code = (
+        "import sys; from edge.board_settings import PoseSettings as S; from edge.config import RigGeometry as G\n"
+        "from edge.odometry.oak import OakSource\n"
+        f"s = OakSource(S(kind='oak'), G(), ({PYTHON!r}, '-m', 'edge.odometry.oak_child')); s.start()\n"
+        "while not any(hasattr(i, 'position_m') for i in s.poll(1.0)): pass\n"
+        "print(s.pid, flush=True)\n"
+        "while True: s.poll(1.0)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=ROOT)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait(30)
+    parent.stdout.close()
+    deadline_s = time.monotonic() + 30.0
+    while Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
 
 
 SAFE = re.compile(r"AF_(UNIX|LOCAL|NETLINK)|AF_INET6?.*(127\.0\.0\.1|::1)")

@@ -27,11 +27,12 @@ from edge.odometry.oak_child import (
     OFFLINE,
     PATIENCE,
     FramePairing,
+    Sender,
     TurnRate,
     main,
     pose_time,
 )
-from edge.odometry.oak_record import PoseFlag, RecordReader, TextRecord
+from edge.odometry.oak_record import Kind, PoseFlag, RecordReader, TextRecord
 from edge.odometry.source import PoseEvent
 
 FAKE = Path(__file__).with_name("fake_oak_child.py")
@@ -247,6 +248,23 @@ def test_the_child_ends_when_this_process_lets_go_of_it(make: Maker) -> None:
 def test_telemetry_is_off_in_the_only_way_that_counts() -> None:
     assert OFFLINE["DEPTHAI_TELEMETRY"] in ("0", "off", "OFF", "false")
     assert OFFLINE["DEPTHAI_PROTOCOL"] == "usb"
+
+
+def test_a_full_pipe_never_stops_the_camera_and_shows_in_the_numbers() -> None:
+    ours, theirs = os.pipe()
+    sender, reader = Sender(theirs), RecordReader()
+    for number in range(2000):  # a pipe holds 512
+        sender.text(Kind.ALIVE, str(number))
+    first = reader.feed(os.read(ours, 1 << 20))
+    sender.text(Kind.ALIVE, "after")
+    (last,) = reader.feed(os.read(ours, 1 << 20))
+    os.close(ours)
+    assert [record.sequence for record in first] == list(range(len(first)))
+    assert 0 < len(first) < 2000
+    assert last.sequence == 2000
+    with pytest.raises(BrokenPipeError):
+        sender.text(Kind.ALIVE, "nobody reads")
+    os.close(theirs)
 
 
 class Queue:
