@@ -28,6 +28,8 @@ _LOG = logging.getLogger(__name__)
 _SYNC_READS = 32
 """Words in which the sync word must come; a chip that is late fills with FF before it (TI's host reads 1000 bytes)."""
 _EVENTS_KEPT = 64
+_SILENT = "the chip hangs, or its supply is weak: configure it anew"
+_SILENT_BOOT = "the chip has no power, or booted in another than functional mode (SOP lines)"
 
 
 class ChipAnswerError(LinkError):
@@ -137,7 +139,7 @@ class Chips:
             if message is None:
                 raise AnswerTimeoutError(
                     f"{self._name(device)} did not report {block.name} (0x{block:04x}) within {timeout_s:g} s",
-                    action="the chip hangs, or its supply is weak: it is reset and configured anew",
+                    action=_SILENT_BOOT if block == Event.POWERED_UP else _SILENT,
                 )
             self._keep(device, *message)
         return found
@@ -177,7 +179,7 @@ class Chips:
             if read is None:
                 raise AnswerTimeoutError(
                     f"{self._name(device)} did not answer {command.name} within {self._timeouts.answer_s:g} s",
-                    action="the chip hangs, or its supply is weak: it is reset and configured anew",
+                    action=_SILENT,
                 )
             message, t_ns = read
             if message.header.kind == Kind.EVENT:
@@ -270,7 +272,7 @@ class Chips:
                 raise ChipFaultError(
                     f"{self._name(device)} reports a {fault} (event 0x{block:04x})",
                     value=data.hex(),
-                    action="it is reset and configured anew; if it stays, check firmware image and supply",
+                    action="configure it anew; if it stays, check firmware image and supply",
                 )
             if fault:
                 _LOG.warning("%s reports a %s while it boots: %s", self._name(device), fault, data.hex())

@@ -22,6 +22,8 @@ KEEP_ALIVE = (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 20))
 _RECEIVE_BYTES = 4096
 LONGEST_DRAIN_S = 0.1
 """A board that never stops talking is not listened to for longer before an order is sent."""
+_ALONE = "the board serves one host at a time: end other programs that use it; if it rebooted, check its supply"
+_STRANGER = "connect again; if it stays, something else answers at radars.<id>.board.address and control_port"
 _POWER = "check the board's 12 V supply, its Ethernet cable and radars.<id>.board.address, and that it has booted"
 
 
@@ -101,7 +103,7 @@ class Link:
         """Send one packet; what came before it unasked is passed over.
 
         Returns:
-            CLOCK_MONOTONIC when it had gone to the kernel.
+            CLOCK_MONOTONIC just before it left: what it does is done after that.
         Raises:
             LinkLostError: no connection, or it broke.
         """
@@ -109,10 +111,11 @@ class Link:
         connection = self._connected()
         try:
             connection.settimeout(self._timeouts.connect_s)
-            connection.sendall(packet.to_bytes())
+            data, t_ns = packet.to_bytes(), time.monotonic_ns()
+            connection.sendall(data)
         except OSError as error:
             raise self._lost(f"the connection broke while {order_name(packet.opcode)} was sent: {error}") from error
-        return time.monotonic_ns()
+        return t_ns
 
     def answer(
         self,
@@ -196,7 +199,7 @@ class Link:
         try:
             packets = self._reader.feed(data)
         except PacketError as error:
-            raise self._lost(f"garbage instead of a packet: {error}") from error
+            raise self._lost(f"garbage instead of a packet: {error}", _STRANGER) from error
         for packet in packets:
             if packet.opcode != Opcode.HOST_IRQ:
                 self._replies.append((packet, t_ns))
@@ -233,7 +236,6 @@ class Link:
             f"{self._where} did not answer {text} within {timeout_s:g} s{stray}", action=f"{_POWER}; reset it with S1"
         )
 
-    def _lost(self, why: str) -> LinkLostError:
+    def _lost(self, why: str, action: str = _ALONE) -> LinkLostError:
         self.close()
-        action = "the board serves one host at a time: end other programs that use it; if it rebooted, check its supply"
         return LinkLostError(f"{self._where}: {why}", action=action)

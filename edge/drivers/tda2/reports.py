@@ -37,7 +37,7 @@ def check_calibration(name: str, data: bytes) -> None:
             f"{name}: initial calibration failed: {', '.join(failed)}",
             value=f"0x{status:04x}",
             allowed=f"0x{asked:04x}",
-            action="it is reset and configured anew; if it stays, check the supply of the RF board",
+            action="configure it anew; if it stays, check the supply of the RF board",
         )
 
 
