@@ -24,6 +24,7 @@ VERBS = {
     "import": "turn a TI capture into a recording, or a TI calibration into ours",
     "calibrate": "make a calibration from a corner-reflector capture; align two boards",
     "info": "describe a recording, a rig or a model; rigs with every hardware rule",
+    "keys": "make CURVE keys; let subscribers of other machines in, or refuse them",
     "doctor": "check this machine; --warm compiles the kernels before the first start",
     "bench": "time every stage beside a named peer in the same process",
 }

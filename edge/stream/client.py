@@ -6,14 +6,16 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 
 import zmq
 
 from edge.errors import ConfigError, WireError
 from edge.stream.decode import decode
+from edge.stream.keys import Certificate, read_secret
 from edge.stream.messages import Header, HeartbeatMessage, Message
-from edge.stream.wire import HEARTBEAT_HZ, MAJOR, MESSAGE_LIMIT_BYTES
+from edge.stream.wire import FLAG_REPEATED, HEARTBEAT_HZ, MAJOR, MESSAGE_LIMIT_BYTES, split_conflatable
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5600"
 ALIVE_PERIODS = 10
@@ -30,6 +32,8 @@ def connect(
     topics: Sequence[str] = (),
     timeout_s: float | None = None,
     latest: bool = False,
+    keys: str | Path | None = None,
+    conflate: bool = False,
 ) -> Client:
     """Subscribe to an appliance.
 
@@ -38,29 +42,42 @@ def connect(
         topics: for example ("shape", "pose") or ("shape/car", "heat/vertical"); none: everything.
         timeout_s: silence after which iteration ends; None: never.
         latest: of the messages that wait, give only the newest of each topic (for slow readers).
+        keys: the client's ``NAME.key_secret`` (``rfconstruct keys client``), for an appliance on another machine.
+        conflate: the address is one of ``stream.latest_endpoints``; ZeroMQ itself keeps nothing but the newest message
+            of each of ``topics``, however long the reader is busy.
     Returns:
         The client; iterate over it.
     Raises:
-        ConfigError: the address is not one.
+        ConfigError: the address is not one, the keys cannot be used, or ``conflate`` without topics.
     """
-    return Client(endpoint, topics, timeout_s, latest)
+    return Client(endpoint, topics, timeout_s, latest, keys, conflate)
 
 
 class Client:
     """The receiving end of docs/wire_format.md; made by ``connect``. Not for use by several threads.
 
     Args:
-        endpoint, topics, timeout_s, latest: of ``connect``.
+        endpoint, topics, timeout_s, latest, keys, conflate: of ``connect``.
     """
 
-    def __init__(self, endpoint: str, topics: Sequence[str], timeout_s: float | None, latest: bool) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        topics: Sequence[str],
+        timeout_s: float | None,
+        latest: bool = False,
+        keys: str | Path | None = None,
+        conflate: bool = False,
+    ) -> None:
         self.endpoint = endpoint
         self.malformed = 0
         """Messages that did not follow the format and were dropped."""
         self.ignored = 0
         """Messages of a type that this version does not know."""
         self.skipped = 0
-        """Messages passed over because a newer one of their topic was waiting (``latest``)."""
+        """Messages passed over because a newer one of their topic was waiting (``latest``, ``conflate``)."""
+        self.repeated = 0
+        """Messages that were sent again for somebody else, and were dropped because they are known here."""
         self.restarts = 0
         """How often the publisher was started anew while this client listened."""
         self._topics = [f"{MAJOR}/{topic.strip('/')}/" for topic in topics]
@@ -68,14 +85,25 @@ class Client:
         self._boot = b""
         self._sequence: dict[str, int] = {}
         self._lost: dict[str, int] = {}
-        self._beats_ns: deque[int] = deque(maxlen=RATE_WINDOW)
+        self._newest_ns: dict[str, int] = {}
+        self._beats: deque[tuple[int, int]] = deque(maxlen=RATE_WINDOW)
         self._heard_s: float | None = None
         self._ready: deque[Message] = deque()
+        if conflate and not topics:
+            raise ConfigError("conflate keeps one message a topic", value=list(topics), allowed="name the topics")
+        certificate = None if keys is None else _client_keys(Path(keys))
+        self._conflate = conflate
+        wanted = [*self._topics, _HEARTBEAT_TOPIC] if topics else [""]
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = _sub_socket(self._context, [*self._topics, _HEARTBEAT_TOPIC] if topics else [""])
+        self._sockets: list[zmq.Socket[bytes]] = []
+        self._poller = zmq.Poller()
         try:
-            self._socket.setsockopt(zmq.IPV6, int("[" in endpoint))
-            self._socket.connect(endpoint)
+            for prefixes in [[prefix] for prefix in dict.fromkeys(wanted)] if conflate else [wanted]:
+                receiver = _sub_socket(self._context, prefixes, certificate, conflate)
+                self._sockets.append(receiver)
+                self._poller.register(receiver, zmq.POLLIN)
+                receiver.setsockopt(zmq.IPV6, int("[" in endpoint))
+                receiver.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
             raise ConfigError(
@@ -92,18 +120,19 @@ class Client:
     @property
     def alive(self) -> bool:
         """Whether a message came within the last second, or is waiting to be taken."""
-        if self._socket.closed:
+        if self._closed:
             return False
         recent = self._heard_s is not None and time.monotonic() - self._heard_s < ALIVE_PERIODS / HEARTBEAT_HZ
-        return recent or bool(self._ready) or self._socket.poll(0) != 0
+        return recent or bool(self._ready) or bool(self._poller.poll(0))
 
     @property
     def frequency_ok(self) -> bool:
         """Whether the last heartbeats (up to two seconds of them) came at 90 % of ten a second or more."""
-        if not self.alive or len(self._beats_ns) < 2:
+        if not self.alive or len(self._beats) < 2:
             return False
-        span_ns = self._beats_ns[-1] - self._beats_ns[0]
-        return (len(self._beats_ns) - 1) * 1e9 >= LEAST_RATE * HEARTBEAT_HZ * span_ns
+        (first, first_ns), (last, last_ns) = self._beats[0], self._beats[-1]
+        sent = last - first if self._conflate else len(self._beats) - 1
+        return sent * 1e9 >= LEAST_RATE * HEARTBEAT_HZ * (last_ns - first_ns)
 
     def recv(self, timeout_s: float | None = None) -> Message | None:
         """The next message.
@@ -116,14 +145,17 @@ class Client:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._ready:
             left_ms = None if deadline_s is None else max(0, round(1000 * (deadline_s - time.monotonic())))
-            if self._socket.closed or not self._socket.poll(left_ms):
+            if self._closed or not self._poller.poll(left_ms):
                 return None
             self._take()
         return self._ready.popleft()
 
     def close(self) -> None:
         """Disconnect; iteration ends."""
-        self._socket.close(linger=0)
+        for receiver in self._sockets:
+            if receiver in self._poller:
+                self._poller.unregister(receiver)
+            receiver.close(linger=0)
         self._context.term()
 
     def __iter__(self) -> Iterator[Message]:
@@ -138,24 +170,29 @@ class Client:
     ) -> None:
         self.close()
 
+    @property
+    def _closed(self) -> bool:
+        return self._context.closed
+
     def _take(self) -> None:
-        """Take one message, or all that wait and the newest of each topic when only the latest count."""
+        """Take one message of each socket, or all that wait and the newest of each topic when only the latest count."""
         newest: dict[str, Message] = {}
-        for _ in range(RECEIVE_HIGH_WATER_MARK if self._latest else 1):
-            try:
-                frames = self._socket.recv_multipart(zmq.DONTWAIT)
-            except zmq.Again:
-                break
-            message = self._accept(frames)
-            if message is not None:
-                self.skipped += newest.pop(message.header.topic, None) is not None
-                newest[message.header.topic] = message
+        for receiver in self._sockets:
+            for _ in range(RECEIVE_HIGH_WATER_MARK if self._latest else 1):
+                try:
+                    frames = receiver.recv_multipart(zmq.DONTWAIT)
+                except zmq.Again:
+                    break
+                message = self._accept(frames)
+                if message is not None:
+                    self.skipped += newest.pop(message.header.topic, None) is not None
+                    newest[message.header.topic] = message
         self._ready.extend(newest.values())
 
     def _accept(self, frames: list[bytes]) -> Message | None:
         """Decode and account for one message; None when the caller did not ask for it."""
         try:
-            message = decode(frames)
+            message = decode(split_conflatable(frames[0]) if self._conflate and len(frames) == 1 else frames)
         except WireError:
             self.malformed += 1
             return None
@@ -163,11 +200,25 @@ class Client:
             self.ignored += 1
             return None
         self._heard_s = time.monotonic()
-        self._count(message.header)
+        if self._known(message.header):
+            self.repeated += 1
+            return None
         if isinstance(message, HeartbeatMessage):
-            self._beats_ns.append(message.header.t_pub_ns)
+            self._beats.append((message.header.sequence, message.header.t_pub_ns))
         wanted = not self._topics or message.header.topic.startswith(tuple(self._topics))
         return message if wanted else None
+
+    def _known(self, header: Header) -> bool:
+        """Account for a message; whether it was received before and is only repeated for another subscriber."""
+        topic = header.topic
+        if self._conflate and header.boot == self._boot and self._sequence.get(topic) == header.sequence:
+            return True
+        self._count(header)
+        before_ns = self._newest_ns.get(topic)
+        if header.flags & FLAG_REPEATED and before_ns is not None and header.t_ns <= before_ns:
+            return True
+        self._newest_ns[topic] = header.t_ns
+        return False
 
     def _count(self, header: Header) -> None:
         """Gaps in the topic's sequence; another boot or a sequence that goes back is a new start."""
@@ -176,13 +227,34 @@ class Client:
             self.restarts += bool(self._boot)
             self._boot, last = header.boot, None
             self._sequence.clear()
-            self._beats_ns.clear()
+            self._newest_ns.clear()
+            self._beats.clear()
         if last is not None and header.sequence > last + 1:
-            self._lost[header.topic] = self._lost.get(header.topic, 0) + header.sequence - last - 1
+            missing = header.sequence - last - 1
+            self.skipped += missing if self._conflate else 0
+            if not self._conflate:
+                self._lost[header.topic] = self._lost.get(header.topic, 0) + missing
         self._sequence[header.topic] = header.sequence
 
 
-def _sub_socket(context: zmq.Context[zmq.Socket[bytes]], prefixes: Sequence[str]) -> zmq.Socket[bytes]:
+def _client_keys(path: Path) -> Certificate:
+    """The client's pair and the appliance's public key; ConfigError when one is missing or others may read them."""
+    certificate = read_secret(path)
+    if not certificate.server:
+        raise ConfigError(
+            f"keys: {path} does not say which appliance",
+            allowed='server-key = "public key of the appliance"',
+            action="rfconstruct keys client makes a complete file",
+        )
+    return certificate
+
+
+def _sub_socket(
+    context: zmq.Context[zmq.Socket[bytes]],
+    prefixes: Sequence[str],
+    certificate: Certificate | None,
+    conflate: bool,
+) -> zmq.Socket[bytes]:
     """A SUB socket with bounded queues that notices a dead peer and keeps looking for it."""
     receiver = context.socket(zmq.SUB)
     for option, value in (
@@ -196,6 +268,12 @@ def _sub_socket(context: zmq.Context[zmq.Socket[bytes]], prefixes: Sequence[str]
         (zmq.RECONNECT_IVL_MAX, 1000),
     ):
         receiver.setsockopt(option, value)
+    if conflate:
+        receiver.setsockopt(zmq.CONFLATE, 1)
+    if certificate is not None:
+        receiver.setsockopt(zmq.CURVE_SERVERKEY, certificate.server)
+        receiver.setsockopt(zmq.CURVE_PUBLICKEY, certificate.public)
+        receiver.setsockopt(zmq.CURVE_SECRETKEY, certificate.secret)
     for prefix in prefixes:
         receiver.setsockopt_string(zmq.SUBSCRIBE, prefix)
     return receiver
