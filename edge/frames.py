@@ -60,6 +60,10 @@ class LossCause(StrEnum):
     """A queue was full and the oldest frame was dropped."""
     GAP = "gap"
     """The source skipped the frame: its number is missing."""
+    SHED = "shed"
+    """Left out on purpose because the machine is overloaded."""
+    FAILED = "failed"
+    """A stage raised an error that it should not, or never came back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,6 +277,7 @@ class FusedCloud:
         frames: frames in the window, those without points included.
         complete: True when the window covers the configured travel; False when time, a pose gap or the end cut it.
         sensor_m: float64 [3], mean position of the rig over the window's frames, window frame; NaN: not known.
+        last: pose of the rig at the window's last frame; None: not known.
     """
 
     xyz_m: Float32
@@ -285,6 +290,7 @@ class FusedCloud:
     frames: int
     complete: bool
     sensor_m: Float64
+    last: Pose | None = None
 
     def __len__(self) -> int:
         return len(self.xyz_m)
@@ -304,6 +310,9 @@ class ObjectCloud:
         frames: frames of the window.
         complete: as in FusedCloud.
         sensor_m: float64 [3], mean position of the rig over the window's frames, object frame; NaN: not known.
+        pose_vehicle: object frame in the vehicle frame (base_link) at ``t_end_ns``; None: not known.
+        age_s: from the window's end at which the object was first seen to this one's.
+        final: the object has left the window; nothing more will be seen of it.
     """
 
     identity: int
@@ -316,6 +325,9 @@ class ObjectCloud:
     frames: int
     complete: bool
     sensor_m: Float64
+    pose_vehicle: Pose | None = None
+    age_s: float = 0.0
+    final: bool = False
 
     def __len__(self) -> int:
         return len(self.xyz_m)
@@ -353,3 +365,8 @@ class Shape:
     def input_points(self) -> int:
         """Points that the shape was made from."""
         return len(self.input) if self.seen_points is None else self.seen_points
+
+    @property
+    def pose_vehicle(self) -> Pose | None:
+        """Object frame in the vehicle frame (base_link) at the end of the window; None: not known."""
+        return self.input.pose_vehicle

@@ -14,6 +14,7 @@ from edge.frames import Float64, FusedCloud, ObjectCloud, Pose
 from edge.fusion import kernels_cluster as kernels
 from edge.fusion.identities import IdentityKeeper
 from edge.odometry.transforms import rotation_matrix
+from edge.odometry.vehicle import in_vehicle
 
 FARTHEST_M = 10_000.0
 _UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -61,7 +62,7 @@ class ObjectTracker:
 
     def __init__(self, settings: ObjectSettings, geometry: RigGeometry) -> None:
         self._settings = settings
-        self._height_m = geometry.height_m
+        self._geometry, self._height_m = geometry, geometry.height_m
         self._identities = IdentityKeeper(settings.match_m, settings.forget_s)
         self._grid = kernels.make_grid(4096)
         self.last_report = ObjectReport()
@@ -142,15 +143,17 @@ class ObjectTracker:
         origin_m = np.array([center_m[0], center_m[1], 0.0])
         rig_m = np.array([0.0, 0.0, self._height_m])
         sensor_m = rotation_matrix(cloud.reference.quaternion_xyzw) @ cloud.sensor_m + rig_m
+        pose = Pose(cloud.t_end_ns, cloud.reference.position_m - rig_m + origin_m, _UPRIGHT.copy())
         return ObjectCloud(
             identity=identity,
             xyz_m=(xyz_m[member] - origin_m).astype(np.float32),
             power_db=cloud.power_db[member],
-            pose=Pose(cloud.t_end_ns, cloud.reference.position_m - rig_m + origin_m, _UPRIGHT.copy()),
+            pose=pose,
             t_start_ns=cloud.t_start_ns,
             t_end_ns=cloud.t_end_ns,
             travel_m=cloud.travel_m,
             frames=cloud.frames,
             complete=cloud.complete,
             sensor_m=sensor_m - origin_m,
+            pose_vehicle=None if cloud.last is None else in_vehicle(pose, cloud.last, self._geometry),
         )

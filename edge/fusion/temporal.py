@@ -79,6 +79,7 @@ class TemporalFusion:
         self._frames = 0  # ever stored; frame k lies at k % MAX_FRAMES
         self._start = 0  # first frame of the window
         self._oldest = 0  # first point of the window that is still there
+        self._cut = 0  # first frame after the last interruption
         self._anchor_m = np.zeros(3)
         self._anchor_path_m = 0.0
         self._last: Pose | None = None
@@ -100,6 +101,7 @@ class TemporalFusion:
         closed = self._close(cut) if cut else None
         if cut:
             self._begin(self._frames)
+            self._cut = self._frames
         path_m = self._advance(pose, restart=cut is not None)
         if self._frames > self._start and self._is_too_old(pose.t_ns):
             closed = self._close(WindowEnd.TIME)
@@ -114,8 +116,31 @@ class TemporalFusion:
         """The stream has ended: the window under way, incomplete; None when it has no frame. Then all starts anew."""
         closed = self._close(WindowEnd.FLUSH) if self._frames > self._start else None
         self._begin(self._frames)
-        self._last = None
+        self._cut, self._last = self._frames, None
         return closed
+
+    def latest(self) -> FusedCloud | None:
+        """The newest ``travel_m`` of travel, whatever window they belong to; nothing is closed or changed.
+
+        It slides with every frame, where the windows of ``add`` hop: what a viewer wants to see now. It reaches back to
+        the last frame that lies ``travel_m`` behind, not beyond an interruption, ``max_time_s`` or what the rings hold.
+
+        Returns:
+            The cloud; None before the first frame, after ``flush`` and after an interruption.
+        """
+        if self._frames == self._cut:
+            return None
+        oldest = max(self._cut, self._frames - MAX_FRAMES)
+        slots = np.arange(oldest, self._frames) % MAX_FRAMES
+        newest = slots[-1]
+        first = int(np.searchsorted(self._t_ns[slots], self._t_ns[newest] - self._max_time_ns))
+        behind = self._path_m[slots] <= self._path_m[newest] - self.settings.travel_m + PATH_TOLERANCE_M
+        far = int(np.flatnonzero(behind)[-1]) + 1 if behind.any() else 0
+        start = oldest + max(first, far - 1)
+        first_point = int(self._first_point[start % MAX_FRAMES])
+        whole = far > first and self._points - first_point <= self.settings.capacity
+        enough = self._frames - start >= self.settings.min_frames
+        return self._cloud(start, max(first_point, self._points - self.settings.capacity), whole and enough)
 
     def _check(self, cloud: PointCloud, pose: Pose) -> None:
         if pose.t_ns != cloud.t_ns:
@@ -196,18 +221,18 @@ class TemporalFusion:
             frame += 1
         self._begin(frame)
 
-    def _travel_m(self) -> float:
-        """Path from the window's first to its last frame."""
-        return max(float(self._path_m[(self._frames - 1) % MAX_FRAMES] - self._path_m[self._start % MAX_FRAMES]), 0.0)
+    def _travel_m(self, start: int | None = None) -> float:
+        """Path from a frame, the window's first one by default, to the last frame."""
+        first = self._start if start is None else start
+        return max(float(self._path_m[(self._frames - 1) % MAX_FRAMES] - self._path_m[first % MAX_FRAMES]), 0.0)
 
-    def _reference(self) -> tuple[Pose, Float64]:
-        slot = self._start % MAX_FRAMES
-        position, quaternion = self._pose[slot, :3].copy(), self._pose[slot, 3:].copy()
-        return Pose(int(self._t_ns[slot]), position, quaternion), rotation_matrix(quaternion)
+    def _pose_of(self, frame: int) -> Pose:
+        slot = frame % MAX_FRAMES
+        return Pose(int(self._t_ns[slot]), self._pose[slot, :3].copy(), self._pose[slot, 3:].copy())
 
-    def _mean_position_m(self) -> Float64:
-        """Mean position of the rig over the window's frames, in the odometry frame."""
-        mean: Float64 = self._pose[np.arange(self._start, self._frames) % MAX_FRAMES, :3].mean(axis=0)
+    def _mean_position_m(self, start: int) -> Float64:
+        """Mean position of the rig from a frame to the last one, in the odometry frame."""
+        mean: Float64 = self._pose[np.arange(start, self._frames) % MAX_FRAMES, :3].mean(axis=0)
         return mean
 
     def _close(self, end: WindowEnd) -> FusedCloud | None:
@@ -216,17 +241,23 @@ class TemporalFusion:
         if frames == 0:
             return None
         self.windows[end] += 1
-        reference, rotation = self._reference()
         whole = self._oldest == int(self._first_point[self._start % MAX_FRAMES])
-        points = self._points - self._oldest
+        complete = end is WindowEnd.TRAVEL and frames >= self.settings.min_frames and whole
+        return self._cloud(self._start, self._oldest, complete)
+
+    def _cloud(self, start: int, first_point: int, complete: bool) -> FusedCloud:
+        """The points from ``first_point`` on, seen from the pose of frame ``start``."""
+        reference, last = self._pose_of(start), self._pose_of(self._frames - 1)
+        rotation = rotation_matrix(reference.quaternion_xyzw)
+        points = self._points - first_point
         xyz, power = np.empty((points, 3), dtype=np.float32), np.empty(points, dtype=np.float32)
         number = np.empty(points, dtype=np.int64)
         kernels.read(
-            *(self._xyz, self._power, self._number, self._oldest, rotation, reference.position_m, xyz, power, number),
+            *(self._xyz, self._power, self._number, first_point, rotation, reference.position_m, xyz, power, number),
         )
-        t_end_ns = int(self._t_ns[(self._frames - 1) % MAX_FRAMES])
         return FusedCloud(
-            *(xyz, power, number, reference, reference.t_ns, t_end_ns, self._travel_m(), frames),
-            complete=end is WindowEnd.TRAVEL and frames >= self.settings.min_frames and whole,
-            sensor_m=(self._mean_position_m() - reference.position_m) @ rotation,
+            *(xyz, power, number, reference, reference.t_ns, last.t_ns, self._travel_m(start), self._frames - start),
+            complete=complete,
+            sensor_m=(self._mean_position_m(start) - reference.position_m) @ rotation,
+            last=last,
         )

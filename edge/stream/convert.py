@@ -27,7 +27,7 @@ from edge.frames import (
 from edge.stream.fields import U32
 from edge.stream.messages import ShapeMessage, State, Status
 from edge.stream.points import pack_points
-from edge.stream.wire import FLAG_CUT_WINDOW, FLAG_FEW_FRAMES, MAJOR, Draft
+from edge.stream.wire import FLAG_CUT_WINDOW, FLAG_FEW_FRAMES, FLAG_FINAL, MAJOR, Draft
 
 HEATMAP_STEP_DB = 0.5
 EXTENT_QUANTILES = (0.01, 0.99)
@@ -76,13 +76,16 @@ def encode_shape(shape: Shape, encoding: str = "f4", send_input: bool = True) ->
         "travel_m": float(cloud.travel_m),
         "lat_us": dict(shape.latency_us),
         "model": bytes.fromhex(shape.model),
+        "age_s": float(cloud.age_s),
         "pts": block,
     }
+    if shape.pose_vehicle is not None:
+        fields["pose_v"] = _pose(shape.pose_vehicle)
     payloads = [payload]
     if send_input:
         fields["in"], partial = pack_points(_xyz(cloud.xyz_m), encoding)
         payloads.append(partial)
-    flags = _window_flags(cloud.frames, cloud.complete)
+    flags = _window_flags(cloud.frames, cloud.complete) | (FLAG_FINAL if cloud.final else 0)
     return Draft(f"{MAJOR}/shape/{shape.class_name}/", "shape", cloud.t_end_ns, "object", flags, fields, payloads)
 
 

@@ -31,7 +31,7 @@ from edge.stream.messages import (
     StatusMessage,
 )
 from edge.stream.points import read_points
-from edge.stream.wire import BOOT_BYTES, FLAG_CUT_WINDOW, HASH_BYTES, SOURCES, Received, Source, unpack
+from edge.stream.wire import BOOT_BYTES, FLAG_CUT_WINDOW, FLAG_FINAL, HASH_BYTES, SOURCES, Received, Source, unpack
 
 AXIS_LIMIT = 4096
 
@@ -126,6 +126,9 @@ def _shape(header: Header, received: Received) -> ShapeMessage:
         model=fields.binary("model", HASH_BYTES).hex(),
         fine_m=_xyz(received, "pts", 0),
         input_m=_xyz(received, "in", 1) if "in" in fields else None,
+        pose_vehicle=_pose(fields.section("pose_v")) if "pose_v" in fields else None,
+        age_s=fields.number("age_s") if "age_s" in fields else 0.0,
+        final=bool(header.flags & FLAG_FINAL),
     )
 
 

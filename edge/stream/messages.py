@@ -68,6 +68,9 @@ class ShapeMessage:
         model: first 16 hex digits of the model file's SHA-256.
         fine_m: float32 [n, 3], object frame.
         input_m: float32 [m, 3], the partial input in the object frame, or None when it was not sent.
+        pose_vehicle: object frame in the vehicle frame (base_link), or None when it was not sent.
+        age_s: since the object was first seen; 0 from a publisher of version 1.0.
+        final: the object has left the window; no more of it will come.
     """
 
     header: Header
@@ -86,6 +89,9 @@ class ShapeMessage:
     model: str
     fine_m: Float32
     input_m: Float32 | None
+    pose_vehicle: Pose | None = None
+    age_s: float = 0.0
+    final: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ import numpy as np
 from edge.errors import WireError
 from edge.stream.fields import U32, Fields
 
-MAJOR, MINOR = 1, 0
+MAJOR, MINOR = 1, 1
 TOPIC_LIMIT_BYTES = 128
 HEADER_LIMIT_BYTES = 64 * 2**10
 MESSAGE_LIMIT_BYTES = 4 * 2**20
@@ -37,6 +37,8 @@ FLAG_FEW_FRAMES = 2
 """The window holds fewer than 60 frames."""
 FLAG_REPEATED = 8
 """Published before; sent again because somebody subscribed."""
+FLAG_FINAL = 4
+"""The object has left the window: its last shape, made of the window that saw most of it."""
 
 HEARTBEAT_HZ = 10.0
 HEATMAP_HZ = 10.0

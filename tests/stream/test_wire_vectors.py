@@ -104,5 +104,5 @@ def test_the_document_names_every_key_flag_and_limit() -> None:
         missing = [key for key in header if f"`{key}`" not in DOCUMENT]
         assert not missing, f"{draft.type}: {missing}"
         assert f"`{draft.type}`" in DOCUMENT
-    for text in ("[1, 0]", "header 64 KiB", "whole message 4 MiB", "topic 128 bytes", "8 payloads"):
+    for text in ("[1, 1]", "header 64 KiB", "whole message 4 MiB", "topic 128 bytes", "8 payloads"):
         assert text in DOCUMENT
