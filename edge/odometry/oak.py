@@ -136,7 +136,8 @@ class OakSource:
             return
         code = self._child.exit_code()  # asked before the last records are read, so that none is lost
         for record in self._child.read(0.0 if code is not None else wait_s):
-            self._take(record)
+            if not self._child.stopping:  # said to be silent: what still comes is too late
+                self._take(record)
         if code is not None:
             self._died(code)
         elif not self._child.stopping and time.monotonic() > self._quiet_s:
