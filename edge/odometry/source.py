@@ -8,6 +8,7 @@ odometry frame with z up, on CLOCK_MONOTONIC, strictly later one by one.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -99,7 +100,7 @@ class PoseSource(Protocol):
 
     @property
     def health(self) -> PoseHealth:
-        """Counters and state now."""
+        """Counters and state now; may be read from any thread."""
 
     def start(self) -> None:
         """Begin. DependencyError, ConfigError, PoseError: it cannot."""
@@ -163,6 +164,7 @@ class Meter:
         self._clock = clock
         self._last_ns: int | None = None
         self._recent: deque[int] = deque(maxlen=RATE_SPAN)
+        self._lock = threading.Lock()
 
     def accept(self, pose: Pose) -> bool:
         """Count a pose; False, and it counts as refused, when it is not later than the last or later than now."""
@@ -170,21 +172,23 @@ class Meter:
         if early or pose.t_ns > self._clock() + LARGEST_AHEAD_S * NS_PER_S:
             self.refused += 1
             return False
-        self._last_ns = pose.t_ns
-        self._poses += 1
-        self._recent.append(pose.t_ns)
+        with self._lock:
+            self._last_ns = pose.t_ns
+            self._poses += 1
+            self._recent.append(pose.t_ns)
         return True
 
     def health(self) -> PoseHealth:
-        """The counters now."""
-        span_ns = self._recent[-1] - self._recent[0] if len(self._recent) > 1 else 0
-        stopped = self._last_ns is None or self._clock() - self._last_ns > self._timeout_ns
-        rate_hz = 0.0 if stopped or not span_ns else (len(self._recent) - 1) * NS_PER_S / span_ns
+        """The counters now; from any thread."""
+        with self._lock:
+            poses, last_ns = self._poses, self._last_ns
+            intervals, span_ns = len(self._recent) - 1, self._recent[-1] - self._recent[0] if self._recent else 0
+        stopped = last_ns is None or self._clock() - last_ns > self._timeout_ns
         return PoseHealth(
             state=self.state,
-            poses=self._poses,
-            last_pose_ns=self._last_ns,
-            rate_hz=rate_hz,
+            poses=poses,
+            last_pose_ns=last_ns,
+            rate_hz=0.0 if stopped or not span_ns else intervals * NS_PER_S / span_ns,
             restarts=self.restarts,
             doubtful=self.doubtful,
             time_guessed=self.time_guessed,
@@ -194,7 +198,8 @@ class Meter:
 
     def pause(self) -> None:
         """Poses that come after a restart are not of the same rate."""
-        self._recent.clear()
+        with self._lock:
+            self._recent.clear()
 
 
 def make_pose_source(rig: Rig) -> PoseSource | None:
