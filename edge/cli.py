@@ -18,6 +18,7 @@ from edge.errors import ExitCode, RfconstructError
 from edge.version import version
 
 VERBS = {
+    "run": "set up a rig's boards, start them interleaved, run the whole pipeline on their frames",
     "demo": "drive past one object (simulated point scatterers), publish its shape, draw pictures",
     "replay": "play a recording through the whole pipeline and publish what comes out",
     "listen": "print what a running pipeline publishes",

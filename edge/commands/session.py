@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``replay`` and ``demo`` share: model, publisher, pictures and pipeline put together, played, reported."""
+"""What ``replay``, ``run`` and ``demo`` share: model, publisher, pictures, pipeline; played, then reported."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -34,10 +34,13 @@ JOIN_S = 1.2
 """Subscribers that wait for the address look for it every second at most."""
 
 
-def add_arguments(parser: argparse.ArgumentParser, speed: str) -> None:
-    """Options that both verbs have."""
+def add_arguments(parser: argparse.ArgumentParser, speed: str | None) -> None:
+    """Options that the verbs share; ``speed`` None: frames come when they come."""
     help_text = "1 = as recorded, 2 = twice as fast, max = as fast as it goes (default: %(default)s)"
-    parser.add_argument("--speed", type=arguments.speed, default=speed, help=help_text)
+    if speed is None:
+        parser.set_defaults(speed=0.0)
+    else:
+        parser.add_argument("--speed", type=arguments.speed, default=speed, help=help_text)
     parser.add_argument("--plot", type=Path, metavar="DIR", help="write pictures there (extra 'plot')")
     parser.add_argument("--endpoint", action="append", metavar="ADDRESS", help="publish there instead of the rig's")
     parser.add_argument("--no-publish", action="store_true", help="publish nothing")
@@ -78,7 +81,7 @@ class Session:
     ) -> None:
         self.rig, self.tally, self.notes = rig, Tally(), list(notes)
         self._args, self._stack, self._interrupts = args, ExitStack(), Interrupts()
-        self._undrawn = False
+        self._undrawn = self._running = False
         model, more = load_model(rig)
         self.notes += more
         sinks: list[Sink] = [self.tally] if args.json else [self.tally, Narrator()]
@@ -99,37 +102,58 @@ class Session:
             settings = replace(settings, endpoints=tuple(self._args.endpoint))
         publisher = Publisher(settings, self.rig.config_hash, self.rig.calibration_hash, kind)
         self._stack.callback(publisher.close)
-        self._say(f"publishing on {', '.join(publisher.endpoints)}")
+        self.say(f"publishing on {', '.join(publisher.endpoints)}")
         return PublishingSink(publisher, version())
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Print a line, unless stdout is for a machine."""
         if not self._args.json:
             print(text, flush=True)
 
-    def run(self, source: Iterable[RadarFrame | Pose | Loss], total: int | None) -> None:
+    def stopped(self) -> bool:
+        """Whether Ctrl-C or SIGTERM came; gives a sign of life when one is due."""
+        if self._publishing is not None and self._running:
+            self._publishing.report()
+        return self._interrupts.asked()
+
+    def run(
+        self,
+        source: Iterable[RadarFrame | Pose | Loss],
+        total: int | None,
+        prepare: Callable[[], None] | None = None,
+    ) -> None:
         """Play the source to its end, or until Ctrl-C or SIGTERM; either way the publisher says STOP.
 
         The addresses are bound before the kernels are ready: until then heartbeats say INIT.
+
+        Args:
+            source: frames, poses and losses.
+            total: of its frames, when it knows.
+            prepare: called when the kernels are ready: configures boards, for example.
         """
         publishing, asked = self._publishing, self._interrupts.asked
         idle = publishing.report if publishing is not None else None
         with self._stack, self._interrupts:
             try:
-                self._warm_up()
+                self._warm_up(prepare)
+                self._running = True
                 if publishing is not None and not asked():
                     publishing.invite(JOIN_S)
                 play(source, self.pipeline, self._args.speed, total, not self._args.json, idle, asked)
             finally:
+                self._running = False
                 if publishing is not None:
                     publishing.report("STOP")
         if self._interrupts.received is not None:
             self.notes.append(f"ended by {self._interrupts.received.name}: the rest was not played")
 
-    def _warm_up(self) -> None:
+    def _warm_up(self, prepare: Callable[[], None] | None) -> None:
         start_s = time.monotonic()
         with self._publishing.starting() if self._publishing is not None else nullcontext():
             warm_up(self.rig, self.pipeline)
-        self._say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+            self.say(f"kernels ready after {time.monotonic() - start_s:.1f} s")
+            if prepare is not None and not self._interrupts.asked():
+                prepare()
 
     def report(self, extra: dict[str, Any] | None = None) -> None:
         """Print the account on stdout, then draw: a picture that fails costs no figures."""

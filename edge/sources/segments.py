@@ -114,6 +114,7 @@ class SegmentSource:
         clock: of the interleaved start; None: the host's.
     Attributes:
         reports: of every segment.
+        frames: of a segment.
     Raises:
         ConfigError: two radars that cannot be interleaved.
     """
@@ -135,7 +136,7 @@ class SegmentSource:
     ) -> None:
         self.reports: list[SegmentReport] = []
         self._rig, self._boards, self._fetchers = rig, dict(boards), fetchers
-        self._frames, self._segments, self._folder, self._poses = frames, segments, folder, poses
+        self.frames, self._segments, self._folder, self._poses = frames, segments, folder, poses
         self._keep, self._say, self._closed, self._broken = keep, say, False, False
         self._asked, self._discarded = stopped, set[tuple[RadarId, str]]()
         periods = {radar: x.schedule.frame_period_s_actual for radar, x in rig.radars.items()}
@@ -148,7 +149,7 @@ class SegmentSource:
     @property
     def total_frames(self) -> int | None:
         """Frames of all radars."""
-        return None if self._segments is None else self._segments * self._frames * len(self._boards)
+        return None if self._segments is None else self._segments * self.frames * len(self._boards)
 
     def close(self) -> None:
         """End the iteration."""
@@ -192,9 +193,9 @@ class SegmentSource:
             first, second = (self._boards[radar] for radar in RADARS)
             start = self._starter.start(first, second, self._arm_again, restart_both=True)
             times = start.times
-        self._say(f"segment {number}: {self._frames} frames{f', {start.text()}' if start else ''}")
+        self._say(f"segment {number}: {self.frames} frames{f', {start.text()}' if start else ''}")
         last_ns = max(each.answered_ns for each in times.values())
-        end_s = last_ns / 1e9 + self._frames * self._period_s
+        end_s = last_ns / 1e9 + self.frames * self._period_s
         while (rest_s := end_s - time.monotonic()) > 0 and not self._stopped():
             time.sleep(min(rest_s, NAP_S))
         for board in self._boards.values():
@@ -203,7 +204,7 @@ class SegmentSource:
 
     def _arm(self) -> None:
         for board in self._boards.values():
-            board.arm(self._frames)
+            board.arm(self.frames)
 
     def _arm_again(self) -> None:
         """After a start that missed its window: what was recorded is of no use."""
@@ -258,11 +259,11 @@ class SegmentSource:
         session = Path(self._boards[radar].directory).name
         folder = self._fetchers[radar].fetch(session, self._folder / radar, self._stopped)
         capture = CaptureFolder(folder, self._rig, radar, times.sent_ns)
-        if capture.total_frames > self._frames:
+        if capture.total_frames > self.frames:
             raise CaptureError(
                 f"{folder} holds more frames than were asked for",
                 value=capture.total_frames,
-                allowed=f"{self._frames}",
+                allowed=f"{self.frames}",
                 action="the folder was used before: let every recording have its own",
             )
         return capture
@@ -271,8 +272,8 @@ class SegmentSource:
         self, capture: CaptureFolder, segment: int, times: StartTimes, counts: dict[RadarId, int]
     ) -> Iterator[Item]:
         """The capture's items with the source's numbers; what is missing becomes losses, so that all n are counted."""
-        radar, base = capture.radar, segment * self._frames
-        period_ns, absent = round(1e9 * self._period_s), self._frames - capture.total_frames
+        radar, base = capture.radar, segment * self.frames
+        period_ns, absent = round(1e9 * self._period_s), self.frames - capture.total_frames
         begin = 0
         if capture.board_start_ns is not None:
             begin = self._clocks[radar].missing(capture.board_start_ns, times.sent_ns, absent)
@@ -291,14 +292,14 @@ class SegmentSource:
             else:
                 counts[radar] = counts.get(radar, 0) + 1
                 yield RadarFrame(radar, number, t_ns, item.adc, item.layout)
-        rest = base + self._frames - expected
+        rest = base + self.frames - expected
         if rest:
             detail = f"segment {segment}: {rest} frames at its end were not recorded"
             yield Loss(radar, expected, LossCause.GAP, detail, t_ns + period_ns, rest)
 
     def _all_lost(self, radar: RadarId, segment: int, why: str) -> Loss:
-        base = segment * self._frames
-        return Loss(radar, base, LossCause.GAP, f"segment {segment}: {why}", time.monotonic_ns(), self._frames)
+        base = segment * self.frames
+        return Loss(radar, base, LossCause.GAP, f"segment {segment}: {why}", time.monotonic_ns(), self.frames)
 
     def _remove(self) -> None:
         """A segment that was played takes no space, here or there."""
