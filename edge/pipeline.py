@@ -6,12 +6,9 @@ It wires the stages together and keeps the account of every frame; nothing is co
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
-
-import numpy as np
 
 from edge.accounting import FrameLedger
 from edge.completion.model import CompletionModel
@@ -36,18 +33,14 @@ from edge.frames import (
 from edge.fusion.association import Associator
 from edge.fusion.objects import ObjectTracker
 from edge.fusion.temporal import TemporalFusion
-from edge.odometry.track import PoseTrack
+from edge.pair_gate import MAX_WAITING_PAIRS as MAX_WAITING_PAIRS
+from edge.pair_gate import REFUSED_POSES as REFUSED_POSES
+from edge.pair_gate import Faults as Faults
+from edge.pair_gate import PairGate
 from edge.rig import Rig
 from edge.sources.base import Loss
-from edge.sources.pairing import FramePair, FramePairer
+from edge.sources.pairing import FramePair
 from edge.timing import StageTimes
-
-MAX_WAITING_PAIRS = 64
-"""Frame pairs that wait for a later pose before the oldest is given up: about a second at 60 frames/s."""
-FARTHEST_M = 1e8
-"""Positions beyond are no odometry, whatever its origin; arithmetic with them would overflow."""
-REFUSED_POSES = 30
-"""Poses refused in a row before the pose clock counts as restarted: one stamp of the far future must not end all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,23 +89,6 @@ class Sink(Protocol):
         """One window of travel is done."""
 
 
-@dataclass(slots=True)
-class Faults:
-    """What went wrong apart from lost frames, counted; ``last`` says the newest in words.
-
-    Args:
-        poses_refused: poses that were no poses or went backwards in time.
-        shapes_withheld: objects whose completion was not finite or failed.
-        dead_channels: radar id -> names of channels that gave constant values.
-        last: newest message.
-    """
-
-    poses_refused: int = 0
-    shapes_withheld: int = 0
-    dead_channels: dict[RadarId, tuple[str, ...]] = field(default_factory=dict)
-    last: str = ""
-
-
 class Pipeline:
     """All stages of one rig in one thread.
 
@@ -134,18 +110,15 @@ class Pipeline:
         self.rig, self.sinks, self._completion = rig, list(sinks), completion
         self.radars: tuple[RadarId, ...] = tuple(radar for radar in RADARS if radar in rig.radars)
         self.times, self.faults = StageTimes(), Faults()
-        self._pairer = FramePairer(self.radars)
-        self.ledgers: dict[RadarId, FrameLedger] = self._pairer.ledgers
+        self._gate = PairGate(rig, self.faults)
+        self.ledgers: dict[RadarId, FrameLedger] = self._gate.ledgers
+        self._epoch = 0
         made = imaging or {r: _imaging(rig, r) for r in self.radars}
         self._imagers = {r: made[r][0] for r in self.radars}
         self._detectors = {r: made[r][1] for r in self.radars}
-        self._track = PoseTrack(settings.fusion.max_pose_gap_s)
         self._associator = Associator(rig) if len(self.radars) == len(RADARS) else None
         self._fusion = TemporalFusion(settings.fusion)
         self._tracker = ObjectTracker(settings.objects, rig.geometry)
-        self._waiting: deque[FramePair] = deque()
-        self._newest_pose_ns: int | None = None
-        self._refused_in_a_row = 0
 
     def feed(self, item: RadarFrame | Pose | Loss) -> None:
         """Take the next frame, pose or loss of a source, in the source's order.
@@ -153,14 +126,13 @@ class Pipeline:
         Raises:
             CaptureError: a radar that the rig does not have, or another layout than its schedule's; nothing was taken.
         """
-        if isinstance(item, Pose):
-            self._add_pose(item)
-        else:
-            self._check_layout(item)
-            pairs, losses = self._pairer.add(item)
-            self._note(losses)
-            self._waiting.extend(pairs)
+        self._gate.add(item)
         self._work()
+
+    def new_pose_frame(self) -> None:
+        """Poses from now on are in another odometry frame: the window is closed, the track begins anew."""
+        self._gate.new_pose_frame()
+        self._follow(self._gate.epoch)
 
     def rehearse(self, frames: Mapping[RadarId, RadarFrame]) -> None:
         """Image and detect frames that count nowhere; the real ones then find every table and buffer.
@@ -179,72 +151,24 @@ class Pipeline:
 
     def finish(self) -> None:
         """The source has ended: what still waits is processed or counted, the last window is closed."""
-        self._note(self._pairer.flush())
+        self._gate.end()
         self._work(last=True)
         self._close(self._fusion.flush())
         for ledger in self.ledgers.values():
             ledger.check()
 
-    def _check_layout(self, item: RadarFrame | Loss) -> None:
-        board = self.rig.radars.get(item.radar)
-        if isinstance(item, RadarFrame) and board is not None and item.layout != board.schedule.layout:
-            raise CaptureError(
-                f"{item.radar} frame {item.number} has another layout than the schedule of rig {self.rig.name}",
-                value=item.layout,
-                allowed=str(board.schedule.layout),
-                action="use the rig that the capture was made with",
-            )
-
-    def _add_pose(self, pose: Pose) -> None:
-        """Refuse it, or restart the track after so many in a row that the clock or the sensor must have restarted."""
-        try:
-            if np.abs(pose.position_m).max() > FARTHEST_M:
-                raise PoseError(f"pose at {pose.t_ns} ns", value=pose.position_m.tolist(), allowed=f"<= {FARTHEST_M} m")
-            self._track.add(pose)
-            self._newest_pose_ns, self._refused_in_a_row = pose.t_ns, 0
-        except PoseError as error:
-            self.faults.poses_refused += 1
-            self.faults.last = str(error)
-            self._refused_in_a_row += 1
-            if self._refused_in_a_row >= REFUSED_POSES:
-                self._close(self._fusion.flush())
-                self._track.clear()
-                self._newest_pose_ns, self._refused_in_a_row = None, 0
-
-    def _note(self, losses: Sequence[Loss]) -> None:
-        """Remember the newest loss in words; the pairer has counted it."""
-        if losses:
-            last = losses[-1]
-            self.faults.last = f"{last.radar} frame {last.number}: {last.cause.value}: {last.detail}"
-
-    def _give_up(self, pair: FramePair) -> None:
-        """No pose for this pair."""
-        why = self._track.why_none(pair.t_ns) or "no other pose near enough to know the velocity"
-        self._lose_pair(pair, LossCause.NO_POSE, f"frame {pair.number}: {why}")
-
-    def _lose_pair(self, pair: FramePair, cause: LossCause, why: str) -> None:
-        self.faults.last = why
-        for radar in pair.frames:
-            self.ledgers[radar].lost(cause)
-
     def _work(self, last: bool = False) -> None:
-        """Process every waiting pair whose pose and velocity are known, or known never to come.
+        """Process every pair that is ready."""
+        for ready in self._gate.ready(last):
+            self._follow(ready.epoch)
+            self._process(ready.pair, ready.pose, ready.velocity_m_s)
+        self._follow(self._gate.epoch)
 
-        One radar needs no pose, but uses it: while there are poses its frames wait for theirs, too.
-        """
-        while self._waiting:
-            pair = self._waiting[0]
-            pose, velocity_m_s = self._track.at(pair.t_ns), self._track.velocity_rig_m_s(pair.t_ns)
-            if velocity_m_s is None:
-                newest_ns = self._newest_pose_ns
-                due = self._associator is not None if newest_ns is None else pair.t_ns >= newest_ns
-                if due and not last and len(self._waiting) <= MAX_WAITING_PAIRS:
-                    return
-            self._waiting.popleft()
-            if velocity_m_s is None and self._associator is not None:
-                self._give_up(pair)
-            else:
-                self._process(pair, pose, velocity_m_s)
+    def _follow(self, epoch: int) -> None:
+        """Another odometry frame has begun: the window of the old one is closed."""
+        if epoch != self._epoch:
+            self._epoch = epoch
+            self._close(self._fusion.flush())
 
     def _process(self, pair: FramePair, pose: Pose | None, velocity_m_s: Float64 | None) -> None:
         heatmaps = self._image(pair, velocity_m_s)
@@ -260,10 +184,10 @@ class Pipeline:
             cause = LossCause.NOT_FINITE
             fused = self._fuse(cloud, pose)
         except CaptureError as error:
-            self._lose_pair(pair, cause, str(error))
+            self._gate.lose(pair, cause, str(error))
             return
         except PoseError as error:
-            self._lose_pair(pair, LossCause.BACKWARDS_TIME, str(error))
+            self._gate.lose(pair, LossCause.BACKWARDS_TIME, str(error))
             return
         for radar in pair.frames:
             self.ledgers[radar].ok()

@@ -16,6 +16,7 @@ NS_PER_S = 1_000_000_000
 class _Track:
     center_m: Float64
     seen_ns: int
+    first_ns: int
 
 
 class IdentityKeeper:
@@ -56,9 +57,16 @@ class IdentityKeeper:
             identity = found.get(index)
             if identity is None:
                 identity, self._next = self._next, self._next + 1
-            self._tracks[identity] = _Track(center_m.copy(), int(t_ns))
+            known = self._tracks.get(identity)
+            first_ns = int(t_ns) if known is None else known.first_ns
+            self._tracks[identity] = _Track(center_m.copy(), int(t_ns), first_ns)
             identities.append(identity)
         return identities
+
+    def age_s(self, identity: int) -> float:
+        """From the first to the last window in which an identity that is not forgotten was seen, end to end."""
+        track = self._tracks[identity]
+        return (track.seen_ns - track.first_ns) / NS_PER_S
 
     def _match(self, centers_m: Float64) -> dict[int, int]:
         """Object index -> identity for the pairs within reach."""

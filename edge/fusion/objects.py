@@ -155,5 +155,6 @@ class ObjectTracker:
             frames=cloud.frames,
             complete=cloud.complete,
             sensor_m=sensor_m - origin_m,
+            age_s=self._identities.age_s(identity),
             pose_vehicle=None if cloud.last is None else in_vehicle(pose, cloud.last, self._geometry),
         )
