@@ -131,11 +131,14 @@ class PacketSocket:
         self._headers["iov"], self._headers["iovs"] = self._vectors.ctypes.data + rows * np.uint64(16), 1
         self._headers["control"] = self._control.ctypes.data + rows * np.uint64(CONTROL_BYTES)
 
+    def _set(self, option: int, value: int) -> None:
+        self._socket.setsockopt(socket.SOL_SOCKET, option, value)
+
     def _enlarge(self, wanted: int) -> int:
         """Ask for a receive buffer, with force where that is allowed; what the kernel gave."""
         for option in (SO_RCVBUFFORCE, socket.SO_RCVBUF):
             try:
-                self._socket.setsockopt(socket.SOL_SOCKET, option, wanted)
+                self._set(option, wanted)
                 break
             except PermissionError:
                 continue
