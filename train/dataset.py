@@ -23,7 +23,7 @@ from train.objects.mesh import CLASSES, ClassName, Mesh, MeshError
 from train.objects.parametric import generate
 from train.objects.reference import RIDDEN, ObjectRef
 from train.objects.sampling import sample_surface
-from train.perturb import AZIMUTH_SECTORS, PerturbSettings, perturb
+from train.perturb import AZIMUTH_SECTORS, PerturbSettings, perturb, with_neighbour
 
 __all__ = ["CLASSES", "CompletionDataset", "DatasetSettings", "Sample", "mean_shape"]
 
@@ -75,6 +75,8 @@ class DatasetSettings:
             ground; the trainer scales to the unit sphere. Otherwise the line-of-sight frame, the object at any heading.
         sight_sigma_deg, ground_sigma_m: standard deviations of the errors of the line of sight and of the height of the
             ground, as a calibration, a pose and a road that is not level bring them.
+        neighbour_probability: chance, in train without box, of points of something else that stands beside the object
+            and was not segmented from it (``perturb.with_neighbour``).
         epoch_samples: samples of one training epoch, classes in turn.
         evaluation_views: samples of every val and test object, azimuth sectors in turn.
         origin_share: chance of a collected, a procedural (library) and an own parametric object in train, by class;
@@ -95,6 +97,7 @@ class DatasetSettings:
     box_frame: bool = False
     sight_sigma_deg: float = 3.0
     ground_sigma_m: float = 0.02
+    neighbour_probability: float = 0.15
     epoch_samples: int = 20_000
     evaluation_views: int = 8
     origin_share: dict[ClassName, tuple[float, float, float]] = field(
@@ -111,6 +114,8 @@ class DatasetSettings:
     def __post_init__(self) -> None:
         require(1 <= self.min_points <= self.max_points, "dataset.min_points", self.min_points, "1..max_points")
         require(0 <= self.min_spread < 0.3, "dataset.min_spread", self.min_spread, "0..0.3")
+        chance = self.neighbour_probability
+        require(0 <= chance <= 1, "dataset.neighbour_probability", chance, "0..1")
         require(self.sight_sigma_deg >= 0, "dataset.sight_sigma_deg", self.sight_sigma_deg, ">= 0 deg")
         require(self.ground_sigma_m >= 0, "dataset.ground_sigma_m", self.ground_sigma_m, ">= 0 m")
         require(self.truth_points >= 1, "dataset.truth_points", self.truth_points, ">= 1")
@@ -128,7 +133,9 @@ class DatasetSettings:
     @classmethod
     def pcn(cls, **changes: object) -> DatasetSettings:
         """The same objects, their partial clouds made PCN's way: clean depth scans, no errors of the frame."""
-        plain = cls.default(perturbation=PerturbSettings.clean(), sight_sigma_deg=0.0, ground_sigma_m=0.0)
+        plain = cls.default(
+            perturbation=PerturbSettings.clean(), sight_sigma_deg=0.0, ground_sigma_m=0.0, neighbour_probability=0.0
+        )
         return replace(plain, **changes)  # type: ignore[arg-type]
 
 
@@ -196,6 +203,7 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
             "box_frame": self.settings.box_frame,
             "sight_sigma_deg": self.settings.sight_sigma_deg,
             "ground_sigma_m": self.settings.ground_sigma_m,
+            "neighbour_probability": self.settings.neighbour_probability,
         } | ({"perturbation": repr(changed)} if (changed := self.settings.perturbation) != PerturbSettings() else {})
 
     def mesh(self, index: int) -> Mesh:
@@ -231,10 +239,12 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
     def _as_seen(
         self, partial: Float32, truth: Float32, bearing: float, rng: np.random.Generator
     ) -> tuple[Float32, Float32]:
-        """Both clouds in the line-of-sight frame, with the errors of its axis and of the ground."""
+        """Both clouds in the line-of-sight frame, with errors of its axis and of the ground, perhaps a neighbour."""
         error_rad = np.radians(rng.normal(0, self.settings.sight_sigma_deg))
         angle_rad = error_rad - bearing
         partial, truth = turned(partial, angle_rad), turned(truth, angle_rad)
+        if self.split == "train" and rng.random() < self.settings.neighbour_probability:
+            partial = with_neighbour(partial, self.settings.max_points, rng)
         origin_m = (partial.max(axis=0) + partial.min(axis=0)) / 2
         origin_m[2] = rng.normal(0, self.settings.ground_sigma_m)
         return partial - origin_m, truth - origin_m

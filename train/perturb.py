@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from edge.completion.sight import turned
 from edge.frames import Float32, Float64
 from train.depth_scan import Hits, scan
 from train.objects.mesh import Mesh
@@ -25,6 +26,7 @@ __all__ = [
 ]  # fmt: skip
 
 AZIMUTH_SECTORS = 8
+NEIGHBOUR_GAP_M, NEIGHBOUR_SHARE = (0.4, 1.5), (0.05, 0.6)
 _CANDIDATES = 8000
 _REPEATED_SIGMA_M = 0.01
 
@@ -239,6 +241,29 @@ def add_artefacts(points: Float32, view: View, settings: PerturbSettings, rng: n
             _streaks(points[rng.choice(count, int(settings.streak_share * count), replace=False)], view, settings, rng)
         )
     return np.concatenate(added).astype(np.float32)
+
+
+def with_neighbour(cloud: Float32, most: int, rng: np.random.Generator) -> Float32:
+    """The cloud and, after its points, the near part of another one that stands beside it along the path (y).
+
+    The other is the cloud itself, turned at random; 5 to 60 % of its points, 0.4 to 1.5 m away, as the segmentation
+    lets it through.
+
+    Args:
+        cloud: float32 [n, 3], line-of-sight frame. most: points of the result at most.
+    """
+    middle = (cloud.max(axis=0) + cloud.min(axis=0)) / 2 * np.array([1, 1, 0], np.float32)
+    other = turned(cloud - middle, rng.uniform(-np.pi, np.pi)) + middle
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    other[:, 1] += side * ((side * cloud[:, 1]).max() + rng.uniform(*NEIGHBOUR_GAP_M)) - _nearest_edge(other, side)
+    count = min(most - len(cloud), max(1, round(rng.uniform(*NEIGHBOUR_SHARE) * len(cloud))))
+    nearest = np.argsort(side * other[:, 1])[:count]
+    return np.concatenate([cloud, other[nearest]]).astype(np.float32)
+
+
+def _nearest_edge(cloud: Float32, side: float) -> float:
+    """y of the edge that faces away from ``side``."""
+    return side * float((side * cloud[:, 1]).min())
 
 
 def _streaks(points: Float32, view: View, settings: PerturbSettings, rng: np.random.Generator) -> Float64:

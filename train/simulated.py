@@ -108,6 +108,7 @@ class SimulatedDataset(CompletionDataset):
         else:
             truth = truth @ rotation.T + translation
             partial, truth = self._as_seen(partial, truth, bearing_rad(cloud.object, cloud.sensor_m, partial), rng)
+            power_db = np.pad(power_db, (0, len(partial) - len(power_db)))  # a neighbour's power is not known
         if self.split == "train" and rng.random() < MIRROR_SHARE:
             mirror = np.array([1, -1, 1], np.float32)
             partial, truth = partial * mirror, truth * mirror

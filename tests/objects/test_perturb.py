@@ -26,6 +26,7 @@ from train.perturb import (
     perturb,
     snapshot,
     specular_weights,
+    with_neighbour,
 )
 
 PLAIN = PerturbSettings.paper()
@@ -304,3 +305,21 @@ def test_an_object_that_is_not_seen_gives_no_points(car: Mesh) -> None:
 def test_settings_that_cannot_work_are_refused(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=key):
         PerturbSettings(**{key: value})  # type: ignore[arg-type]
+
+
+def test_a_neighbour_stands_beside_the_cloud() -> None:
+    rng = np.random.default_rng(4)
+    cloud = (rng.uniform(-1, 1, (200, 3)) * (1.0, 0.3, 0.7) + (5, 2, 0.7)).astype(np.float32)
+    sides = set()
+    for _ in range(40):
+        both = with_neighbour(cloud, 2048, rng)
+        np.testing.assert_array_equal(both[:200], cloud)
+        other = both[200:]
+        assert 10 <= len(other) <= 120
+        gap = max(other[:, 1].min() - cloud[:, 1].max(), cloud[:, 1].min() - other[:, 1].max())
+        assert gap + 1e-5 >= 0.4
+        assert gap <= 1.5 + 1e-5
+        assert (other[:, 2] >= 0).all()
+        sides.add(bool(other[0, 1] > cloud[0, 1]))
+    assert sides == {False, True}
+    assert len(with_neighbour(cloud, 210, rng)) <= 210

@@ -21,7 +21,7 @@ from train.simulate.build import build, export_clouds, shard_name
 from train.simulate.shards import Shard, encode, read_shard
 from train.simulated import SimulatedDataset
 
-SETTINGS = DatasetSettings(truth_points=2000, epoch_samples=40)
+SETTINGS = DatasetSettings(truth_points=2000, epoch_samples=40, neighbour_probability=0.0)
 EXACT = replace(SETTINGS, sight_sigma_deg=0.0, ground_sigma_m=0.0)
 
 

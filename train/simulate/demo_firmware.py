@@ -169,6 +169,9 @@ class DemoFirmware:
         try:
             if name == "queryDemoStatus":
                 return [f"Sensor State: {self.state:d}", "Data port baud rate: 921600", "Done"]
+            if name == "version":
+                platform = f"xWR{self._device.name[3:5]}xx"
+                return [f"{'Platform':24s}: {platform}", f"{'mmWave SDK Version':24s}: 03.05.00.04", "Done"]
             if name in actions:
                 return [*actions[name](_numbers(arguments)), "Done"]
             if name not in ARGUMENTS:
