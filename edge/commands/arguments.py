@@ -23,6 +23,18 @@ def seconds(text: str) -> float:
     return _number(text, 1e-3, LONGEST_S, f"0.001..{LONGEST_S:g} seconds")
 
 
+def moment(text: str) -> float:
+    """Seconds since a beginning; argparse.ArgumentTypeError when negative or longer than eleven days."""
+    return _number(text, 0.0, LONGEST_S, f"0..{LONGEST_S:g} seconds")
+
+
+def passes(text: str) -> int:
+    """How often, 0 meaning without end; argparse.ArgumentTypeError when it is no whole number."""
+    if not (text.isascii() and text.isdigit() and len(text) <= 9):
+        raise argparse.ArgumentTypeError(f"got {text!r}; allowed: a whole number, 0 = for ever")
+    return int(text)
+
+
 def count(text: str) -> int:
     """A number of things; argparse.ArgumentTypeError when it is not whole and positive."""
     if not (text.isascii() and text.isdigit() and int(text) > 0):
