@@ -13,20 +13,20 @@ import socket
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
 
 from edge import numba_cache
+from edge.commands.checks import Check, failure, lines
 from edge.config import CompletionSettings, StreamSettings
 from edge.errors import ConfigError, ExitCode, RfconstructError
 from edge.resources import data_dir
 from edge.rig import known_rigs, load_rig
 from edge.version import version
 
-Outcome = Literal["ok", "note", "fails"]
+NAME_WIDTH = 19
 OLDEST_PYTHON = (3, 11)
 LEAST_MEMORY_GB = 2.0
 PACKAGES = ("numpy", "numba", "onnxruntime", "pyzmq", "msgpack", "mcap", "tqdm", "pyserial", "pyusb")
@@ -34,30 +34,21 @@ OPTIONAL = {"matplotlib": "plot", "scipy": "import", "depthai": "oak", "viser": 
 FAST_CPU = {"x86_64": ("avx2", "fma"), "aarch64": ("asimd",)}
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One thing looked at.
-
-    Args:
-        name: what.
-        outcome: "ok"; "note": works, but the reader should know; "fails": something will not run.
-        found: what was found.
-        action: what to do; empty when nothing needs doing.
-    """
-
-    name: str
-    outcome: Outcome
-    found: str
-    action: str = ""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("--warm", action="store_true", help="compile the kernels of every shipped rig into the cache")
+    parser.add_argument("--hardware", action="store_true", help="follow every link to the boards of --rig instead")
+    parser.add_argument("--rig", help="with --hardware: name or folder")
+    parser.add_argument("--boards", type=Path, metavar="FILE", help="with --hardware: where the boards are reached")
+    parser.add_argument("--quick", action="store_true", help="with --hardware: configure nothing, take no frames")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look at everything; exit code 0, or 3 when something fails."""
+    """Look at everything; exit code 0, or 3 when something fails; with --hardware 4."""
+    if args.hardware:
+        from edge.commands import doctor_hardware
+
+        return doctor_hardware.run(args)
     steps: list[Callable[[], Check]] = [
         machine,
         cpu_features,
@@ -77,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         check = attempt(step)
         checks.append(check)
         if not args.json:
-            print("\n".join(lines(check)), flush=True)
+            print("\n".join(lines(check, NAME_WIDTH)), flush=True)
     failed = [check for check in checks if check.outcome == "fails"]
     code = ExitCode.DEGRADED if failed else ExitCode.OK
     if args.json:
@@ -93,18 +84,9 @@ def attempt(step: Callable[[], Check]) -> Check:
     try:
         return step()
     except RfconstructError as error:
-        allowed = f"; allowed: {error.allowed}" if error.allowed else ""
-        value = "" if error.value is None else f": {error.value}"
-        return Check(name, "fails", f"{error.what}{value}{allowed}", error.action or "install rfconstruct again")
+        return failure(name, error, "install rfconstruct again")
     except Exception as error:  # a broken package can raise anything when it is imported
         return Check(name, "fails", f"{type(error).__name__}: {error}", "install rfconstruct again")
-
-
-def lines(check: Check) -> Iterator[str]:
-    """For people."""
-    yield f"{check.outcome:<6}{check.name:<19}{check.found}"
-    if check.action:
-        yield f"{'':<25}-> {check.action}"
 
 
 def machine() -> Check:
