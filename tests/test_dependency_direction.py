@@ -13,7 +13,7 @@ EDGE = sorted((ROOT / "edge").rglob("*.py"))
 STANDARD = {"__future__", "math", "typing", "collections", "dataclasses", "enum", "functools"}
 DATA = {"edge.frames", "edge.config", "edge.errors", "edge.waveform", "edge.array", "edge.rig"}
 HEAVY = {"scipy", "matplotlib", "mpl_toolkits", "tqdm", "depthai", "trimesh", "viser"}
-PROCESS_FILES = ("bench", "cli", "commands", "plot", "player", "publish", "warm", "__main__")
+PROCESS_FILES = ("bench", "cli", "commands", "plot", "player", "publish", "service", "view", "warm", "__main__")
 PROCESSES = ("edge.cli", "edge.commands", "edge.plot", "edge.pipeline")
 
 
@@ -61,7 +61,7 @@ def test_nothing_below_imports_processes(path: Path) -> None:
     if relative.startswith(tuple(f"edge/{name}" for name in PROCESS_FILES)):
         return
     for name in imports(path):
-        assert not name.startswith(PROCESSES), f"{relative} imports {name}"
+        assert not any(name == one or name.startswith(f"{one}.") for one in PROCESSES), f"{relative} imports {name}"
 
 
 @pytest.mark.parametrize("path", EDGE, ids=label)
