@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 
 from edge.errors import WireError
-from edge.stream.wire import Draft, split, unpack
+from edge.stream.wire import FLAG_REPEATED, Draft, split, unpack
 
 STAMP_KEYS = frozenset(
     ("v", "type", "boot", "seq", "t_ns", "t_pub_ns", "utc_ns", "utc_ok", "frame", "src", "cfg", "cal", "flags", "pl")
@@ -25,7 +25,7 @@ class StoredResult:
     """One message.
 
     Args:
-        draft: what was published, without its stamp.
+        draft: what was published, without its stamp; not marked as repeated any more.
         header: the whole header as it was sent.
     """
 
@@ -48,7 +48,7 @@ def parse(block: bytes) -> StoredResult:
     received = unpack(frames)
     fields = received.fields
     kind, frame, t_ns = fields.text("type"), fields.text("frame"), fields.instant("t_ns")
-    flags = fields.integer("flags", U32 - 1)
+    flags = fields.integer("flags", U32 - 1) & ~FLAG_REPEATED
     fields.binary("cfg", 8), fields.binary("cal", 8), fields.binary("boot", 16), fields.integer("seq")
     header = msgpack.unpackb(frames[1])
     own = {key: value for key, value in header.items() if key not in STAMP_KEYS}
