@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes results over ZeroMQ; a subscriber that is slow, stuck or hostile never holds it up.
 
-One socket serves this machine. Another serves other machines, with CURVE and an authenticator, and lets nobody in when
-that dies. A third gives single-frame messages to those who want only the newest.
+One socket serves this machine. Another, with an I/O thread of its own, serves other machines with CURVE and an
+authenticator, and lets nobody in when that dies. More of both give single-frame messages to who wants only the newest.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from edge.errors import ConfigError
 from edge.frames import Detections, FusedCloud, Heatmap, PointCloud, Pose, Shape
 from edge.stream import convert
 from edge.stream.addresses import checked_endpoint, is_local
-from edge.stream.authenticator import Authenticator
-from edge.stream.keys import KeyFolder
+from edge.stream.authenticator import Authenticator, HandshakeMonitor
+from edge.stream.keys import Certificate, KeyFolder
 from edge.stream.messages import State, Status
 from edge.stream.outlet import Outlet
 from edge.stream.wire import (
@@ -86,10 +86,12 @@ class Publisher:
         self.fault = ""
         """Why part of the stream is closed; empty while all is well."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._remote_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._outlets: list[Outlet] = []
         self._latest: list[Outlet] = []
         self._guarded: list[Outlet] = []
         self._authenticator: Authenticator | None = None
+        self._monitors: list[HandshakeMonitor] = []
         try:
             self._open(settings)
         except BaseException:
@@ -109,15 +111,22 @@ class Publisher:
             for local in (True, False):
                 chosen = [address for address in addresses if is_local(address) is local]
                 if chosen:
-                    outlet = Outlet(self._context, high_water_mark, None if local else keys.server())
+                    outlet = self._outlet(high_water_mark, None if local else keys.server())
                     outlets.append(outlet)
-                    self._guarded += [] if local else [outlet]
                     to_bind.append((outlet, chosen, setting))
         if self._guarded:
-            guarded = [outlet.socket for outlet in self._guarded]
-            self._authenticator = Authenticator(self._context, guarded, keys.allowed)
+            self._authenticator = Authenticator(self._remote_context, keys.allowed)
         for outlet, addresses, setting in to_bind:
             outlet.bind(addresses, setting)
+
+    def _outlet(self, high_water_mark: int, pair: Certificate | None) -> Outlet:
+        """A socket that is not bound yet, with keys in the context that the authenticator guards."""
+        if pair is None:
+            return Outlet(self._context, high_water_mark)
+        outlet = Outlet(self._remote_context, high_water_mark, pair)
+        self._monitors.append(HandshakeMonitor(self._remote_context, outlet.socket, len(self._monitors)))
+        self._guarded.append(outlet)
+        return outlet
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -132,7 +141,8 @@ class Publisher:
     @property
     def auth_failures(self) -> int:
         """Handshakes from other machines that failed since the start: wrong key, no key, no ZeroMQ."""
-        return self._authenticator.failures if self._authenticator is not None else 0
+        with self._lock:
+            return sum(monitor.failures() for monitor in self._monitors)
 
     def shape(self, shape: Shape) -> list[bytes]:
         """Send a completed object. WireError: points that are not finite or do not fit the encoding."""
@@ -179,11 +189,14 @@ class Publisher:
     def close(self) -> None:
         """Give subscribers half a second to take the last messages, then release the addresses."""
         with self._lock:
+            for monitor in self._monitors:
+                monitor.close()
             for outlet in (*self._outlets, *self._latest):
                 outlet.close()
             if self._authenticator is not None:
                 self._authenticator.stop()
             self._context.term()
+            self._remote_context.term()
 
     def __enter__(self) -> Publisher:
         return self
@@ -224,10 +237,14 @@ class Publisher:
         """Give new subscribers what is kept, and close what is no longer guarded; the lock is held."""
         if self._authenticator is not None and not self._authenticator.alive and not self.fault:
             self.fault = AUTHENTICATOR_DIED
+            for monitor in self._monitors:
+                monitor.close()
             for outlet in self._guarded:
                 outlet.close()
             self._outlets = [outlet for outlet in self._outlets if outlet not in self._guarded]
             self._latest = [outlet for outlet in self._latest if outlet not in self._guarded]
+        for monitor in self._monitors:
+            monitor.failures()
         for outlet in self._outlets:
             self._asked.update(_matching(self._kept, outlet.subscriptions()))
         for outlet in self._latest:
