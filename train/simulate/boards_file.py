@@ -44,6 +44,7 @@ def write_boards(path: Path, rig: VirtualRig) -> None:
     for radar, board in rig.boards.items():
         image = path.with_suffix(".firmware.bin")
         image.write_bytes(stand_in_image())
+        board.recorder.root.mkdir(parents=True, exist_ok=True)
         tables[f"radars.{radar}.board"] = {
             "address": board.address[0],
             "control_port": board.address[1],
