@@ -225,7 +225,7 @@ class McapFile:
         report.bytes_lost += len(data) - offset
 
     def _read_head(self) -> None:
-        """Header, metadata and attachments before the first chunk."""
+        """Header, metadata, attachments and channels before the first chunk."""
         for record in self._records():
             if record.opcode in (Opcode.CHUNK, Opcode.DATA_END) or not record.whole:
                 return
@@ -234,6 +234,10 @@ class McapFile:
             if record.opcode == Opcode.HEADER:
                 header = _parse(Header, self._read(record.offset, record.length))
                 self.profile = "" if header is None else header.profile
+            elif record.opcode == Opcode.CHANNEL:
+                channel = _parse(Channel, self._read(record.offset, record.length))
+                if channel is not None:
+                    self._channels.setdefault(channel.id, channel.topic)
             elif record.opcode == Opcode.METADATA:
                 metadata = _parse(Metadata, self._read(record.offset, record.length))
                 if metadata is not None:
@@ -274,7 +278,7 @@ class McapFile:
 
     @property
     def channels(self) -> dict[int, str]:
-        """Channel id -> topic, as the summary says."""
+        """Channel id -> topic, as the summary says, or else the beginning."""
         return dict(self._channels)
 
     def _read(self, offset: int, length: int) -> bytes:
