@@ -22,7 +22,7 @@ from edge.rig import Rig
 SPIN_S = 5e-3
 """Before the instant of a start the clock is polled for so long: on two busy cores a sleep ended up to 4 ms late."""
 ATTEMPTS = 8
-"""Starts of the second radar before it is given up; a host that is busy for once misses one or two."""
+"""Starts of both radars before they are given up; a host that is busy for once misses one or two."""
 LEAD_PERIODS = 3
 """Whole periods between now and the earliest instant for the second radar."""
 
@@ -61,7 +61,7 @@ class InterleavedStart:
         times: of each radar.
         offset_s: second after first, modulo the period: middle of what the answers allow.
         spread_s: width of what they allow.
-        attempts: starts of the second radar.
+        attempts: starts of both.
     """
 
     times: dict[RadarId, StartTimes]
@@ -97,33 +97,29 @@ class InterleaveStarter:
         self.by_hardware = all(radar.schedule.hardware_trigger for radar in rig.radars.values())
         self._clock: Clock = clock or MonotonicClock()
 
-    def start(
-        self, first: Board, second: Board, rearm: Callable[[], None], restart_both: bool = False
-    ) -> InterleavedStart:
+    def start(self, first: Board, second: Board, rearm: Callable[[], None]) -> InterleavedStart:
         """Start both.
 
         Args:
             first, second: armed.
-            rearm: arms the second board again after a start that missed the window; it is stopped before.
-            restart_both: then both are stopped, ``rearm`` arms both, and both are started: where a board needs
-                seconds to be armed and records a given number of frames.
+            rearm: arms both again after a start that missed the window; they are stopped before. Both, because the
+                first one's answer may be what was late.
         Raises:
             DeviceError: of the boards; LinkError: the window was missed in every attempt.
         """
-        reference, tried = first.start(), list[str]()
-        if self.by_hardware:
-            both: dict[RadarId, StartTimes] = {first.radar: reference, second.radar: second.start()}
-            return InterleavedStart(both, self.window.target_s, 0.0, 1)
+        tried: list[str] = []
         for attempt in range(1, ATTEMPTS + 1):
+            reference = first.start()
+            if self.by_hardware:
+                both: dict[RadarId, StartTimes] = {first.radar: reference, second.radar: second.start()}
+                return InterleavedStart(both, self.window.target_s, 0.0, attempt)
             started = self._try(reference, second, first.radar, attempt, tried)
             if started is not None:
                 return started
             second.stop()
-            if restart_both:
-                first.stop()
+            first.stop()
             if attempt < ATTEMPTS:
                 rearm()
-                reference = first.start() if restart_both else reference
         raise LinkError(
             f"{second.radar} radar could not be started between the bursts of the {first.radar} one",
             value="offsets and their spread " + ", ".join(tried),

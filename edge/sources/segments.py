@@ -191,7 +191,7 @@ class SegmentSource:
             times = {radar: board.start() for radar, board in self._boards.items()}
         else:
             first, second = (self._boards[radar] for radar in RADARS)
-            start = self._starter.start(first, second, self._arm_again, restart_both=True)
+            start = self._starter.start(first, second, self._arm_again)
             times = start.times
         self._say(f"segment {number}: {self.frames} frames{f', {start.text()}' if start else ''}")
         last_ns = max(each.answered_ns for each in times.values())
