@@ -52,7 +52,7 @@ class CardRig:
         self.rig = rig
         self.supply: CyclicSupply = targets(rig, count=3)
         demo = DemoSettings(**{"start_s": 0.0, "restart_s": 0.0, "boot_s": 0.0, **settings.pop("demo", {})})
-        card = Dca1000Settings(**{"deaf_s": 0.01, "flush_s": 0.2, **settings.pop("card", {})})
+        card = Dca1000Settings(**{"deaf_s": 0.01, "flush_s": 2.0, **settings.pop("card", {})})
         chosen = VirtualRigSettings(demo=demo, card=card, **{"pace": 1.0, "links": root / "ports", **settings})
         self.virtual = VirtualRig(rig, self.supply, root, None, chosen, faults)
         self.drivers: dict[RadarId, SingleChipDriver] = {}

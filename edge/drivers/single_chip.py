@@ -27,7 +27,7 @@ from edge.errors import DeviceError, LinkError
 from edge.frames import RadarId
 from edge.waveform import Schedule
 
-FIRST_FRAME_S = 0.5
+FIRST_FRAME_S = 2.0
 """And three frame periods: from the answer to sensorStart to the first packet, or there are no frames."""
 COMPLETED_S = 1.0
 """From record stop to the report that the recording is complete."""

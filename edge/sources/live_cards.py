@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping
 
 import numpy as np
 
@@ -21,16 +20,17 @@ from edge.drivers.interleave import InterleaveStarter
 from edge.drivers.offset import OffsetWatch
 from edge.drivers.single_chip import SingleChipDriver
 from edge.errors import ConfigError, DeviceError, LinkError
-from edge.frames import RADARS, Layout, LossCause, Pose, RadarFrame, RadarId
+from edge.frames import RADARS, LossCause, Pose, RadarFrame, RadarId
 from edge.odometry.source import PoseEvent
 from edge.rig import Rig
 from edge.sources.base import Loss
+from edge.sources.card_lane import Lane, cause_of, time_of
 from edge.sources.frame_clock import FrameClock
 from edge.sources.pose_feed import PoseFeed
 
 Item = RadarFrame | Pose | Loss | PoseEvent
 Starter = Callable[[Board, Board, Callable[[], None]], object]
-"""Starts the second of two armed boards into the gaps of the first; the last argument arms the second one again."""
+"""Starts the second of two armed boards into the gaps of the first; the last argument arms both again."""
 POLL_S = 0.02
 CHECK_S = 0.25
 """Between two looks at what the cards report."""
@@ -49,33 +49,6 @@ GOOD_S = 10.0
 """After so long without a fault the next one is the first again."""
 MOST_MISSED = 30_000
 """Frames of one outage that are counted as missing; the numbering must not jump by more than the pairer takes."""
-
-
-@dataclass(slots=True)
-class _Lane:
-    """One radar's way from receiver to numbers.
-
-    Args:
-        driver: of the radar.
-        layout: of its frames.
-        clock: of the present recording.
-        recording: of the receiver; older ones' frames are nobody's.
-        base: number of the recording's frame 0; None: not known yet.
-        early: came before ``base`` was known.
-        ready: numbered, not yet given, with the instant at which each became ready.
-        last_t_ns: of the latest that was numbered; 0: none.
-        reached: highest number that was numbered.
-    """
-
-    driver: SingleChipDriver
-    layout: Layout
-    clock: FrameClock
-    recording: int = 0
-    base: int | None = None
-    early: deque[Assembled] = field(default_factory=deque)
-    ready: deque[tuple[RadarFrame | Loss, int]] = field(default_factory=deque)
-    last_t_ns: int = 0
-    reached: int = -1
 
 
 class CardSource:
@@ -152,7 +125,7 @@ class CardSource:
             while not self._done:
                 try:
                     if lost_ns:
-                        lost_ns = self._restart(faults, lost_ns)
+                        lost_ns = yield from self._restart(faults, lost_ns)
                     if not running:
                         self._begin()
                         running, lost_ns = True, 0
@@ -172,9 +145,9 @@ class CardSource:
     def _stopped(self) -> bool:
         return self._closing.is_set() or self._asked()
 
-    def _lane(self, driver: SingleChipDriver) -> _Lane:
+    def _lane(self, driver: SingleChipDriver) -> Lane:
         timing = driver.timing
-        return _Lane(driver, driver.schedule.layout, FrameClock(timing.period_s, timing.delay_ns))
+        return Lane(driver, driver.schedule.layout, FrameClock(timing.period_s, timing.delay_ns))
 
     @property
     def _done(self) -> bool:
@@ -186,11 +159,10 @@ class CardSource:
     def _begin(self) -> None:
         """Arm all, start all, forget what came before."""
         drivers = [lane.driver for lane in self._lanes.values()]
-        for driver in drivers:
-            driver.arm(self._total)
+        self._arm()
         if self._starter is not None:
             first, second = drivers
-            result = self._starter(first, second, lambda: second.arm(self._total))
+            result = self._starter(first, second, self._arm)
             self._say(getattr(result, "text", lambda: "both radars started")())
         else:
             drivers[0].start()
@@ -203,6 +175,10 @@ class CardSource:
                 self.watch.restarted(radar)
         self._started_ns = self._checked_ns = self._measured_ns = time.monotonic_ns()
 
+    def _arm(self) -> None:
+        for lane in self._lanes.values():
+            lane.driver.arm(self._total)
+
     def _stop_boards(self) -> None:
         """Second radar first; what fails is said: the boards are set up anew before they are used."""
         for lane in reversed(self._lanes.values()):
@@ -212,8 +188,8 @@ class CardSource:
                 except DeviceError as error:
                     self._say(f"stop: {error}")
 
-    def _restart(self, faults: int, lost_ns: int) -> int:
-        """Set up everything anew after a fault; frames that the outage cost are numbers that never come.
+    def _restart(self, faults: int, lost_ns: int) -> Generator[Loss, None, int]:
+        """Set up everything anew after a fault; frames that the outage cost are given as losses.
 
         Returns:
             Instant up to which the outage is counted.
@@ -227,7 +203,11 @@ class CardSource:
             for note in lane.driver.configure(lambda what, done, total: None):
                 self._say(note)
         now_ns = time.monotonic_ns()
-        self._next += min(round(1e-9 * (now_ns - lost_ns) / self._period_s), MOST_MISSED)
+        if self._next:
+            self._next += min(round(1e-9 * (now_ns - lost_ns) / self._period_s), MOST_MISSED)
+            if self._limit is not None:
+                self._next = min(self._next, self._limit + 1)
+            yield from self._missing("set up anew", now_ns)
         return now_ns
 
     def _rearm(self) -> Iterator[Item]:
@@ -290,7 +270,7 @@ class CardSource:
                     action="end the other program that commands it, or give each card its own address",
                 )
 
-    def _take(self, lane: _Lane) -> bool:
+    def _take(self, lane: Lane) -> bool:
         """Everything from a receiver to its lane."""
         receiver, some = lane.driver.receiver, False
         assert receiver is not None, "it runs"
@@ -321,7 +301,7 @@ class CardSource:
             while lane.early:
                 self._give_number(lane, lane.early.popleft())
 
-    def _give_number(self, lane: _Lane, item: Assembled) -> None:
+    def _give_number(self, lane: Lane, item: Assembled) -> None:
         """A frame or loss with number and time, unless it is of a time when this radar was alone."""
         assert lane.base is not None, "numbered after alignment"
         radar, size = lane.driver.radar, lane.driver.timing.frame_bytes
@@ -343,7 +323,7 @@ class CardSource:
             if self.watch is not None:
                 self.watch.add(radar, kept_first, t_ns)
         else:
-            kept = Loss(radar, kept_first, *_cause(item, size), t_ns, count)
+            kept = Loss(radar, kept_first, *cause_of(item, size), t_ns, count)
         lane.ready.append((kept, time.monotonic_ns()))
 
     def _earliest(self) -> RadarFrame | Loss | None:
@@ -351,11 +331,11 @@ class CardSource:
         lanes = [lane for lane in self._lanes.values() if lane.ready]
         if not lanes:
             return None
-        lane = min(lanes, key=lambda one: _time(one.ready[0][0]))
+        lane = min(lanes, key=lambda one: time_of(one.ready[0][0]))
         item, since_ns = lane.ready[0]
         period_ns = 1e9 * self._period_s
         for other in self._lanes.values():
-            may_come = not other.ready and other.last_t_ns + EARLY_SHARE * period_ns < _time(item)
+            may_come = not other.ready and other.last_t_ns + EARLY_SHARE * period_ns < time_of(item)
             if other is not lane and may_come and time.monotonic_ns() - since_ns < HOLD_PERIODS * period_ns:
                 return None
         lane.ready.popleft()
@@ -376,19 +356,14 @@ class CardSource:
             lane.early.clear()
             lane.ready.clear()
             lane.recording = -1
+        yield from sorted(rest, key=time_of)
         self._next = max(self._next, *(lane.reached + 1 for lane in self._lanes.values()))
-        yield from sorted(rest, key=_time)
+        yield from self._missing("the other radar ran longer", time.monotonic_ns())
 
-
-def _time(item: RadarFrame | Loss) -> int:
-    return item.t_ns if isinstance(item, Loss) else item.t_first_chirp_ns
-
-
-def _cause(item: Assembled, size: int) -> tuple[LossCause, str]:
-    """Why an assembled frame is none."""
-    if item.overflow:
-        return LossCause.OVERFLOW, "nobody took it in time"
-    if item.data is None:
-        return LossCause.GAP, "no packet of it came"
-    whole = "" if item.whole_chirps is None else f", {item.whole_chirps.sum()} of {len(item.whole_chirps)} chirps whole"
-    return LossCause.TRUNCATED, f"{item.missing_bytes} of {size} bytes missing{whole}"
+    def _missing(self, why: str, t_ns: int) -> Iterator[Loss]:
+        """Losses of all numbers that a radar has not reached and that will not be used again."""
+        for radar, lane in self._lanes.items():
+            count = self._next - 1 - lane.reached
+            if count > 0:
+                yield Loss(radar, lane.reached + 1, LossCause.GAP, why, max(t_ns, lane.last_t_ns + 1), count)
+                lane.reached = self._next - 1
