@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,25 +16,28 @@ from edge.constraints import format_table
 from edge.errors import ConfigError, ExitCode, ModelError
 from edge.frames import RADARS
 from edge.recording.reader import RecordingReader
+from edge.recording.survey import survey
 from edge.rig import Rig, known_rigs, load_rig
 from edge.sources.ti_capture import describe_capture
 from edge.sources.ti_index import Gap, gap_notes
 from edge.waveform import Schedule
 
+REMARKS = {"missing_numbers": "numbers missing", "out_of_order": "out of order"}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("target", help="recording (.mcap), TI capture folder, rig name or folder, model name or folder")
+    parser.add_argument("--quick", action="store_true", help="recordings: only what their end says, nothing is checked")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find out what the target is and describe it."""
+    """Find out what the target is and describe it; exit code 3 for a recording that is cut or damaged."""
     path = Path(args.target)
     if path.is_file():
-        with RecordingReader(path) as reader:
-            content = reader.info()
-        print(json.dumps(content, indent=2, default=str) if args.json else "\n".join(pairs(content)))
-        return ExitCode.OK
+        content = describe_recording(path, args.quick, args.json)
+        print(json.dumps(content, indent=2, default=str) if args.json else "\n".join(_recording_lines(content)))
+        return ExitCode.OK if content.get("whole", True) else ExitCode.DEGRADED
     if args.target not in known_rigs() and not (path / "rig.toml").is_file():
         content = describe_folder(path)
         if content:
@@ -45,6 +49,42 @@ def run(args: argparse.Namespace) -> int:
     rig = load_rig(args.target)
     print(json.dumps(rig_as_dict(rig), indent=2) if args.json else "\n".join(describe_rig(rig)))
     return ExitCode.OK
+
+
+def describe_recording(path: Path, quick: bool, quiet: bool) -> dict[str, Any]:
+    """What a recording holds; unless ``quick`` it is read from end to end, with a bar on a terminal.
+
+    Raises:
+        RecordingError: unreadable.
+    """
+    with RecordingReader(path) as reader:
+        return reader.info() if quick else survey(reader, _bar(path, quiet).update)
+
+
+def _bar(path: Path, quiet: bool) -> Any:
+    from tqdm import tqdm
+
+    hidden = quiet or sys.stderr is None or not sys.stderr.isatty()
+    return tqdm(total=path.stat().st_size, unit="B", unit_scale=True, desc="reading", disable=hidden, leave=False)
+
+
+def _recording_lines(content: dict[str, Any]) -> list[str]:
+    """One line a topic instead of nested values."""
+    streams = content.pop("streams", None)
+    if streams is None:
+        return list(pairs(content))
+    counts = content.pop("topics")
+    content = {key: "none" if value in ({}, []) else value for key, value in content.items()}
+    lines = [*pairs(content), "", f"{'topic':<24}{'messages':>9}{'MB':>10}{'from s':>9}{'to s':>9}{'Hz':>9}  remarks"]
+    for topic, facts in streams.items():
+        remarks = [f"{facts['gaps']} gaps, longest {facts['longest_gap']}"] if facts.get("gaps") else []
+        remarks += [f"{facts[key]} {text}" for key, text in REMARKS.items() if facts.get(key)]
+        figures = (
+            f"{facts['megabytes']:>10.2f}{facts['from_s']:>9.2f}{facts['to_s']:>9.2f}{facts.get('rate_hz', 0):>9.2f}"
+        )
+        lines.append(f"{topic:<24}{facts['messages']:>9}{figures}  {', '.join(remarks)}")
+    lines += [f"{topic:<24}{count:>9}" for topic, count in counts.items() if topic not in streams and count]
+    return lines
 
 
 def describe_folder(folder: Path) -> dict[str, Any]:
