@@ -245,16 +245,20 @@ def _require_clock(clock: str) -> None:
 
 
 def _subscriber(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
-    """A SUB socket with a bounded queue that notices a dead peer and keeps looking for it."""
+    """A SUB socket with a bounded queue that notices a dead peer, by TCP, and keeps looking for it.
+
+    No ZMQ_HEARTBEAT_IVL: with a full queue it lets libzmq up to 4.3.5 abort the process (zeromq/libzmq issue 3937).
+    """
     subscriber = context.socket(zmq.SUB)
     for option, value in (
         (zmq.RCVHWM, HIGH_WATER_MARK),
         (zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES),
         (zmq.LINGER, 0),
-        (zmq.HEARTBEAT_IVL, 1000),
-        (zmq.HEARTBEAT_TIMEOUT, 3000),
         (zmq.HANDSHAKE_IVL, 2000),
         (zmq.TCP_KEEPALIVE, 1),
+        (zmq.TCP_KEEPALIVE_IDLE, 2),
+        (zmq.TCP_KEEPALIVE_INTVL, 1),
+        (zmq.TCP_KEEPALIVE_CNT, 3),
         (zmq.RECONNECT_IVL, 100),
         (zmq.RECONNECT_IVL_MAX, 1000),
     ):

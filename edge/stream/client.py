@@ -255,15 +255,21 @@ def _sub_socket(
     certificate: Certificate | None,
     conflate: bool,
 ) -> zmq.Socket[bytes]:
-    """A SUB socket with bounded queues that notices a dead peer and keeps looking for it."""
+    """A SUB socket with bounded queues that notices a dead peer and keeps looking for it.
+
+    A dead peer is noticed by TCP. ZMQ_HEARTBEAT_IVL must not be set here: a reader that is busy while its queue is full
+    misses the answers to its own heartbeats, reconnects, and libzmq up to 4.3.5 aborts the process when it goes on
+    reading (zeromq/libzmq issue 3937).
+    """
     receiver = context.socket(zmq.SUB)
     for option, value in (
         (zmq.RCVHWM, RECEIVE_HIGH_WATER_MARK),
         (zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES),
-        (zmq.HEARTBEAT_IVL, 1000),
-        (zmq.HEARTBEAT_TIMEOUT, 3000),
         (zmq.HANDSHAKE_IVL, 2000),
         (zmq.TCP_KEEPALIVE, 1),
+        (zmq.TCP_KEEPALIVE_IDLE, 2),
+        (zmq.TCP_KEEPALIVE_INTVL, 1),
+        (zmq.TCP_KEEPALIVE_CNT, 3),
         (zmq.RECONNECT_IVL, 100),
         (zmq.RECONNECT_IVL_MAX, 1000),
     ):

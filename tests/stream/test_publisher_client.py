@@ -168,6 +168,38 @@ def test_a_stuck_subscriber_holds_nobody_up() -> None:
     assert 0 < got < count
 
 
+STUCK = """
+import sys, time
+from edge import connect
+with connect(sys.argv[1], ("shape",), timeout_s=float(sys.argv[2])) as client:
+    while not client.alive:
+        time.sleep(0.01)
+    print("there", flush=True)
+    time.sleep(6.0)  # longer than the 3 s after which ZeroMQ's heartbeats give a peer up
+    first = sum(1 for _ in client)
+    print(first, flush=True)
+"""
+
+
+def test_a_reader_that_was_stuck_for_seconds_goes_on_reading() -> None:
+    """With heartbeats of its own on a full queue, libzmq aborts the reader's process (issue 3937)."""
+    with publisher() as sender:
+        command = [sys.executable, "-c", STUCK, sender.endpoints[0], "3.0"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+            assert reader.stdout is not None
+            joined = threading.Event()
+            beats = threading.Thread(target=lambda: [sender.heartbeat() for _ in iter(lambda: joined.wait(0.01), True)])
+            beats.start()
+            assert reader.stdout.readline() == "there\n"
+            joined.set()
+            beats.join()
+            for _ in range(300):
+                sender.shape(shape(16384))
+            received, code = reader.stdout.readline(), reader.wait(60.0)
+    assert code == 0
+    assert int(received) > 0
+
+
 def test_hostile_bytes_on_the_port_change_nothing() -> None:
     with publisher() as sender, subscribed(sender, "pose") as client:
         port = int(sender.endpoints[0].rsplit(":", 1)[1])
