@@ -7,14 +7,13 @@ The demo echoes a line, answers, and writes its prompt; ``Done`` means yes. Sour
 from __future__ import annotations
 
 import contextlib
-import re
 import termios
 import time
 from collections.abc import Callable, Iterable
 
 import serial
-from serial.tools import list_ports
 
+from edge.drivers.usb import cli_port
 from edge.errors import LinkError, RefusalError
 
 PROMPT = b"mmwDemo:/>"
@@ -28,11 +27,8 @@ LONGEST_ANSWER = 1 << 16
 """A board that writes more than this without a prompt talks nonsense."""
 SHOWN = 120
 BANNER = "****"
-CLI_INTERFACE = 0
-"""USB interface of the command line, on XDS110 and on CP2105."""
 GONE = (OSError, termios.error, TypeError)
 """What pyserial raises when a port vanishes, or is closed, under it; SerialException is an OSError."""
-PROBES = {(0x0451, 0xBEF3): "XDS110", (0x0451, 0xBEF4): "XDS110", (0x10C4, 0xEA70): "CP2105"}
 
 
 class DemoCli:
@@ -195,33 +191,15 @@ def find_cli_port(serial_number: str, name: str) -> str:
 
     Args:
         serial_number: of the debugger (XDS110) or bridge (CP2105); empty: the only one there is.
-        name: for messages.
+        name: for messages: "horizontal radar".
     Raises:
         LinkError: none, or several and no serial number.
     """
-    ports = [port for port in list_ports.comports() if is_cli_port(port.vid, port.pid, port.location)]
-    found: dict[str, str] = {port.serial_number or "": port.device for port in ports}
-    if serial_number in found and serial_number:
-        return found[serial_number]
-    if not serial_number and len(found) == 1:
-        return next(iter(found.values()))
-    raise LinkError(
-        f"no serial port for the {name}",
-        value=serial_number or "no serial number given",
-        allowed=", ".join(f"{number} ({path})" for number, path in sorted(found.items())) or "no board is on USB",
-        action=f"set radars.{name.split()[0]}.board.serial_number to one of these, or connect the board",
-    )
-
-
-def is_cli_port(vid: int | None, pid: int | None, location: str | None) -> bool:
-    """Whether a serial port is a command line: a known bridge, and its first interface.
-
-    Args:
-        vid, pid: of the USB device.
-        location: "1-2:1.0" is interface 0 of a device.
-    """
-    interface = re.search(r":\d+\.(\d+)$", location or "")
-    return (vid, pid) in PROBES and (interface is None or int(interface.group(1)) == CLI_INTERFACE)
+    try:
+        return cli_port(serial_number)
+    except LinkError as error:
+        what = f"no serial port for the {name}: {error.what}"
+        raise LinkError(what, value=error.value, allowed=error.allowed, action=error.action) from error
 
 
 def _lines(part: bytes) -> list[str]:

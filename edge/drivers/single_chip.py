@@ -200,6 +200,10 @@ class SingleChipDriver:
             self._receiver.finish()
             self.card.poll()
 
+    def reception(self) -> str:
+        """What the receiver counted since ``connect``, for people; "" before."""
+        return "" if self.receiver is None else self.receiver.counters().text()
+
     def close(self) -> None:
         """Give everything back; never raises."""
         if self.receiver is not None:

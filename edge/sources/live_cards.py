@@ -110,6 +110,10 @@ class CardSource:
         """Frames and losses of all radars; None: endless."""
         return self._total * len(self._radars) or None
 
+    def reception(self) -> dict[RadarId, str]:
+        """What each radar's receiver counted since its board was connected last, in words."""
+        return {radar: lane.driver.reception() for radar, lane in self._lanes.items()}
+
     def close(self) -> None:
         """End the iteration; the boards are stopped then."""
         self._closing.set()

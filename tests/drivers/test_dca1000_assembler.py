@@ -87,7 +87,7 @@ def deliveries(draw: st.DrawFn) -> tuple[int, int, list[int], dict[int, int], li
     return size, frames, order, cuts, garbage, draw(st.integers(1, 50))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(deliveries())
 def test_any_delivery(delivery: tuple[int, int, list[int], dict[int, int], list[int], int]) -> None:
     size, frames, order, cuts, garbage, per_batch = delivery

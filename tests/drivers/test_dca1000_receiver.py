@@ -180,6 +180,7 @@ def test_odd_packets(wires: Any) -> None:
     account = wire.receiver.counters().account
     account.check()
     assert (account.garbage_packets, account.foreign_packets) == (5, 1)
+    assert wire.receiver.counters().text() == "14 packets, 1 from elsewhere, 5 garbage, 1 frames whole"
     assert account.garbage_bytes == 1 + 10 + 1467 + 9000
 
 

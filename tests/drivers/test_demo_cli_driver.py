@@ -16,7 +16,7 @@ from card_rig import slow_pair
 
 from edge.cli_text import cli_lines
 from edge.drivers import demo_cli
-from edge.drivers.demo_cli import DemoCli, find_cli_port, is_cli_port
+from edge.drivers.demo_cli import DemoCli, find_cli_port
 from edge.errors import LinkError, RefusalError
 from train.simulate.demo_cli import DemoRadar, DemoSettings
 from train.simulate.faults import Faults
@@ -77,8 +77,9 @@ def emulated(tmp_path: Path) -> Iterator[Any]:
     faults = Faults()
     settings = DemoSettings(start_s=0.0, restart_s=0.0, boot_s=0.0)
     with DemoRadar("vertical", targets(rig, count=1), lambda data, period_s: None, settings, faults) as radar:
-        cli = DemoCli(radar.port, "vertical radar", answer_s=5.0)
+        cli = DemoCli(radar.port, "vertical radar", answer_s=10.0)
         cli.wait_prompt()
+        cli.command("queryDemoStatus")  # nothing of the start is left
         yield SimpleNamespace(radar=radar, cli=cli, faults=faults, rig=rig)
         cli.close()
 
@@ -114,12 +115,11 @@ def test_refusals_name_line_and_answer(emulated: Any, line: str, answer: str) ->
     assert emulated.cli.command("sensorStop")[-1] == "Done", "the next line is answered as if nothing had been"
 
 
-def test_reset_in_the_middle(emulated: Any) -> None:
-    emulated.faults.set("drop", "vertical/cli", times=1)
-    emulated.cli.send("sensorStop")
-    emulated.radar.reset()
+def test_reset_in_the_middle(scripted: Any) -> None:
+    rule = b"*" * 42 + b"\r\n"
+    cli = scripted(lambda line: b"sensor\r\n" + rule + b"xWR18xx MMW Demo 03.05.00.04\r\n" + rule + PROMPT)
     with pytest.raises(LinkError, match="restarted in the middle") as caught:
-        emulated.cli.answer("sensorStop")
+        cli.command("sensorStop")
     assert caught.value.value == "sensorStop"
 
 
@@ -190,36 +190,16 @@ def test_bytes_that_are_no_text(scripted: Any) -> None:
     assert cli.command("flushCfg") == ["Done"]
 
 
-def port(serial_number: str, device: str, interface: int, vid: int = 0x0451, pid: int = 0xBEF3) -> SimpleNamespace:
-    location = f"1-2:1.{interface}"
-    return SimpleNamespace(vid=vid, pid=pid, serial_number=serial_number, device=device, location=location)
-
-
 def test_port_is_found_by_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    """XDS110 and CP2105: interface 0 is the command line, whatever the ttyACM numbers."""
-    ports = [
-        *(port("R1", "/dev/ttyACM1", 3), port("R1", "/dev/ttyACM0", 0), port("R2", "/dev/ttyACM3", 0)),
-        *(port("C1", "/dev/ttyUSB1", 1, 0x10C4, 0xEA70), port("C1", "/dev/ttyUSB0", 0, 0x10C4, 0xEA70)),
-        port("F1", "/dev/ttyUSB7", 0, 0x0403, 0x6010),
-    ]
-    monkeypatch.setattr(demo_cli.list_ports, "comports", lambda: ports)
+    """Whose port is missing is said; the rest is what the search on USB says."""
+
+    def search(serial_number: str) -> str:
+        if serial_number != "R1":
+            raise LinkError("no such board on USB", value=serial_number, allowed="R1", action="plug it in")
+        return "/dev/ttyACM0"
+
+    monkeypatch.setattr(demo_cli, "cli_port", search)
     assert find_cli_port("R1", "horizontal radar") == "/dev/ttyACM0"
-    assert find_cli_port("C1", "horizontal radar") == "/dev/ttyUSB0"
-    for wanted in ("F1", "", "R9"):
-        with pytest.raises(LinkError, match="no serial port for the vertical radar") as caught:
-            find_cli_port(wanted, "vertical radar")
-        assert "R2 (/dev/ttyACM3)" in caught.value.allowed
-        assert "radars.vertical.board.serial_number" in caught.value.action
-    del ports[2:]
-    assert find_cli_port("", "vertical radar") == "/dev/ttyACM0"
-    ports.clear()
-    with pytest.raises(LinkError, match="no board is on USB"):
-        find_cli_port("", "vertical radar")
-
-
-def test_only_known_bridges_are_command_lines() -> None:
-    assert is_cli_port(0x0451, 0xBEF3, "1-2:1.0")
-    assert is_cli_port(0x0451, 0xBEF3, None)
-    assert not is_cli_port(0x0451, 0xBEF3, "1-2:1.3")
-    assert not is_cli_port(0x0403, 0x6010, "1-2:1.0")
-    assert not is_cli_port(None, None, "1-2:1.0")
+    with pytest.raises(LinkError, match="no serial port for the vertical radar: no such board") as caught:
+        find_cli_port("R9", "vertical radar")
+    assert (caught.value.value, caught.value.allowed, caught.value.action) == ("R9", "R1", "plug it in")

@@ -74,6 +74,7 @@ def test_a_pair_without_faults(tmp_path: Path) -> None:
         assert "offset" in said[0]
         assert cards.violations() == []
         assert source.alone["vertical"] == 0
+        assert source.reception()["vertical"].endswith("frames whole")
         for driver in cards.drivers.values():
             assert driver.receiver is not None
             counters = driver.receiver.counters()

@@ -190,6 +190,23 @@ class ReceiverCounters:
     overflow_frames: int
     queued: int
 
+    def text(self) -> str:
+        """What came and what did not, for people; what never happened is left out."""
+        a = self.account
+        seldom = {
+            "dropped by the kernel": self.kernel_drops,
+            "twice": a.duplicate_packets,
+            "out of order": a.reordered_packets,
+            "too late": a.late_packets,
+            "of another recording": a.outside_packets,
+            "from elsewhere": a.foreign_packets,
+            "garbage": a.garbage_packets,
+        }
+        parts = [f"{a.packets} packets", *(f"{count} {what}" for what, count in seldom.items() if count)]
+        frames = {"cut": a.frames_cut, "missing": a.frames_missing, "not taken in time": self.overflow_frames}
+        parts += [f"{a.frames_whole} frames whole", *(f"{count} {what}" for what, count in frames.items() if count)]
+        return ", ".join(parts)
+
 
 class CardReceiver:
     """Thread that receives one card's samples and keeps its newest frames.
