@@ -173,7 +173,7 @@ def _recording_banner(scene: Scene, store: MessageStore, name: str, player: Play
     if not len(store):
         return Banner("READING", "warn", f"{name}: kernels and model are being loaded")
     inner = scene.health.banner(player.clock_s, name, None)
-    return Banner("PLAYING" if player.playing else "PAUSED", inner.level, f"{name}; then: {inner.state}", inner.reasons)
+    return Banner("PLAYING" if player.playing else "PAUSED", inner.level, f"{name}: {inner.state}", inner.reasons)
 
 
 def _own_figures(scene: Scene) -> dict[str, str]:

@@ -32,6 +32,8 @@ def _table(stops: NDArray[np.integer]) -> Colours:
     return np.stack([np.interp(places, np.arange(len(stops)), stops[:, c]) for c in range(3)], axis=1).astype(np.uint8)
 
 
+SHADE = 0.35
+"""Brightness of a shape's lowest points."""
 RAMP = _table(_STOPS)
 HEAT = _table(np.concatenate([[[14, 15, 24]], _STOPS]))
 """The ramp from almost black: noise stays in the background."""
@@ -52,6 +54,13 @@ def ramp_colour(value: float, low: float = 0.0, high: float = 1.0) -> Rgb:
     """One colour of the ramp."""
     red, green, blue = ramp(np.array([value]), low, high)[0].tolist()
     return red, green, blue
+
+
+def shaded(colour: Rgb, heights_m: NDArray[np.floating]) -> Colours:
+    """One hue for points [n], darker towards the bottom: without light a cloud of one colour has no form."""
+    low, high = float(heights_m.min()), float(heights_m.max())
+    share = SHADE + (1.0 - SHADE) * (heights_m - low) / max(high - low, 1e-6)
+    return np.rint(np.asarray(colour, np.float32) * share[:, None]).astype(np.uint8)
 
 
 def faded(colours: Colours | Rgb, strength: float) -> Colours:

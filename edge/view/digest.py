@@ -68,6 +68,8 @@ def run_pipeline(reader: RecordingReader, pipeline: Pipeline, store: MessageStor
         pipeline.feed(item)
         store.progress = (writer.now_ns - first_ns) / max(last_ns - first_ns, 1)
     pipeline.finish()
+    writer.rush()
+    sink.report()
 
 
 class StoreWriter:
@@ -116,6 +118,10 @@ class StoreWriter:
         """A sign of life, ten a second."""
         if self._due("hb", HEARTBEAT_HZ):
             self._write(convert.encode_heartbeat(state, self.now_ns))
+
+    def rush(self) -> None:
+        """Whatever comes next is due: the last account."""
+        self._due_ns.clear()
 
     def _due(self, key: str, rate_hz: float) -> bool:
         if self.now_ns < self._due_ns.get(key, self.now_ns):

@@ -154,10 +154,10 @@ class Page:
             names = {
                 "show_cloud": "fused cloud",
                 "show_shapes": "shapes",
-                "show_boxes": "boxes and labels",
+                "show_boxes": "boxes, labels",
                 "show_path": "path",
-                "show_points": "points of this frame",
-                "follow": "follow the vehicle",
+                "show_points": "newest frame",
+                "follow": "follow",
             }
             for name, label in names.items():
                 box = gui.add_checkbox(label, initial_value=getattr(look, name))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from edge.frames import Float32, Float64, Pose
-from edge.view.colours import Colours, Rgb, class_colour, faded, ramp, ramp_colour
+from edge.view.colours import Colours, Rgb, class_colour, faded, ramp, ramp_colour, shaded
 from edge.view.scene import Drawables, Thing, Window, boresight_rad, object_label
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ OLDER_WINDOW = 0.5
 PATH_COLOUR: Rgb = (120, 132, 156)
 RIG_COLOUR: Rgb = (240, 200, 80)
 POINT_COLOUR: Rgb = (255, 255, 255)
-CAMERA_BACK_M, CAMERA_UP_M, LOOK_AHEAD_M = 7.0, 5.5, 2.5
+CAMERA_BACK_M, CAMERA_UP_M, LOOK_AHEAD_M = 6.0, 4.2, 2.5
 
 
 @dataclass(slots=True)
@@ -59,6 +59,11 @@ class Stage:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
         self._scene.set_up_direction("+z")
+        self._scene.configure_default_lights(
+            True, cast_shadow=False
+        )
+        self._scene.configure_environment_map(None)  # it and shadows cost a computer without GPU more than they show
+        self._scene.add_light_ambient("/light", intensity=1.5)
         self._root = self._scene.add_frame("/world", show_axes=False)
         self._scene.add_grid(
             *("/grid",),
@@ -68,6 +73,7 @@ class Stage:
             cell_color=(58, 62, 74),
             section_color=(92, 98, 114),
             fade_distance=60.0,
+            shadow_opacity=0.0,
         )
         self._nodes: dict[str, tuple[Hashable, Any]] = {}
         self._generation = -1
@@ -180,7 +186,8 @@ class Stage:
         key = (thing.version, strength, look.shapes)
         if look.show_shapes:
             kept.add(f"{name}/shape")
-            self._points(f"{name}/shape", thing.points_m, faded(plain, strength), 0.03, key, thing.box.center_m)
+            colours = faded(shaded(plain, thing.points_m[:, 2]), strength)
+            self._points(f"{name}/shape", thing.points_m, colours, 0.03, key, thing.box.center_m)
         if look.show_boxes:
             kept |= {f"{name}/box", f"{name}/label"}
             if self._changed(f"{name}/box", key):

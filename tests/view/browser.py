@@ -24,7 +24,7 @@ FLAGS = (
     *("--disable-sync", "--disable-extensions", "--hide-scrollbars", "--remote-debugging-port=0"),
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )
-START_S, CALL_S = 60.0, 60.0
+START_S, CALL_S = 60.0, 180.0
 
 
 class Browser:
@@ -79,7 +79,8 @@ class Browser:
         what = message.get("params", {})
         match message.get("method"):
             case "Network.requestWillBeSent":
-                self.requested.append(what["request"]["url"])
+                if not (url := what["request"]["url"]).startswith("data:"):
+                    self.requested.append(url)
             case "Network.webSocketCreated":
                 self.requested.append(what["url"])
             case "Runtime.exceptionThrown":

@@ -48,6 +48,7 @@ def main() -> int:
             demo = subprocess.Popen([*COMMAND, "demo", "--speed", "0.5"], stdout=subprocess.DEVNULL)
         found = tab.wait_for("document.body.innerText.includes('car')", 60.0)
         print(f"{url}: {'an object' if found else 'no object'} after the wait")
+        tab.evaluate("document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
         for number in range(1, 4):
             time.sleep(4.0)
             print(tab.picture(out / f"viewer_{number}.png"), tab.errors)
