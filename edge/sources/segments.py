@@ -2,15 +2,18 @@
 """Cascades as a source of frames: arm, start interleaved, record n frames, stop, fetch, read, and again.
 
 The capture board cannot stream; what is recorded in one go is a segment. Frame numbers go on from segment to segment,
-times are this host's CLOCK_MONOTONIC: a segment's first frame is where its start command was answered, the others
-follow by the board's own time stamps.
+times are this host's CLOCK_MONOTONIC: a recording's first frame is where its start command went out, the others
+follow by the board's own time stamps. The second radar starts some periods after the first; what one radar records
+while the other does not is nobody's, so that frames of one number are half a period apart.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +30,8 @@ from edge.sources.base import Loss
 from edge.sources.pose_feed import PoseFeed
 from edge.sources.ti_capture import CaptureFolder
 
+MARGIN_S = 0.4
+"""Recorded in addition when there are two radars: the second starts by so much later at the most."""
 NAP_S = 0.05
 FAILURES = 2
 """Segments in a row that may fail entirely; the next failure ends the source."""
@@ -114,7 +119,8 @@ class SegmentSource:
         clock: of the interleaved start; None: the host's.
     Attributes:
         reports: of every segment.
-        frames: of a segment.
+        frames: of a segment, which both radars have.
+        alone: frames of one radar that the other one cannot have, not numbered.
     Raises:
         ConfigError: two radars that cannot be interleaved.
     """
@@ -142,9 +148,12 @@ class SegmentSource:
         periods = {radar: x.schedule.frame_period_s_actual for radar, x in rig.radars.items()}
         self._period_s = max(periods.values())
         self._clocks = {radar: BoardClock(period_s) for radar, period_s in periods.items()}
+        self.alone: Counter[RadarId] = Counter()
         self._starter: InterleaveStarter | None = None
+        self._recorded = frames
         if len(rig.radars) == len(RADARS):
-            self._starter = InterleaveStarter(rig, clock, hold_s=frames * self._period_s)
+            self._recorded += math.ceil(MARGIN_S / self._period_s)
+            self._starter = InterleaveStarter(rig, clock, hold_s=self._recorded * self._period_s)
 
     @property
     def total_frames(self) -> int | None:
@@ -195,7 +204,7 @@ class SegmentSource:
             times = start.times
         self._say(f"segment {number}: {self.frames} frames{f', {start.text()}' if start else ''}")
         last_ns = max(each.answered_ns for each in times.values())
-        end_s = last_ns / 1e9 + self.frames * self._period_s
+        end_s = last_ns / 1e9 + self._recorded * self._period_s
         while (rest_s := end_s - time.monotonic()) > 0 and not self._stopped():
             time.sleep(min(rest_s, NAP_S))
         for board in self._boards.values():
@@ -204,7 +213,7 @@ class SegmentSource:
 
     def _arm(self) -> None:
         for board in self._boards.values():
-            board.arm(self.frames)
+            board.arm(self._recorded)
 
     def _arm_again(self) -> None:
         """After a start that missed its window: what was recorded is of no use."""
@@ -246,7 +255,8 @@ class SegmentSource:
                 problems.append(f"{radar}: {error}")
                 lanes.append(iter([self._all_lost(radar, number, str(error))]))
             else:
-                lanes.append(self._number(capture, number, times[radar], counts))
+                later_ns = max(each.sent_ns for each in times.values()) - times[radar].sent_ns
+                lanes.append(self._number(capture, number, times[radar], int(later_ns / 1e9 // self._period_s), counts))
         fetched_s = time.monotonic() - begun_s
         self._say(f"segment {number}: {'; '.join(problems) or 'fetched'} after {fetched_s:.1f} s")
         if self._poses is not None:
@@ -259,29 +269,41 @@ class SegmentSource:
         session = Path(self._boards[radar].directory).name
         folder = self._fetchers[radar].fetch(session, self._folder / radar, self._stopped)
         capture = CaptureFolder(folder, self._rig, radar, times.sent_ns)
-        if capture.total_frames > self.frames:
+        if capture.total_frames > self._recorded:
             raise CaptureError(
                 f"{folder} holds more frames than were asked for",
                 value=capture.total_frames,
-                allowed=f"{self.frames}",
+                allowed=f"{self._recorded}",
                 action="the folder was used before: let every recording have its own",
             )
         return capture
 
     def _number(
-        self, capture: CaptureFolder, segment: int, times: StartTimes, counts: dict[RadarId, int]
+        self, capture: CaptureFolder, segment: int, times: StartTimes, alone: int, counts: dict[RadarId, int]
     ) -> Iterator[Item]:
-        """The capture's items with the source's numbers; what is missing becomes losses, so that all n are counted."""
+        """The capture's items with the source's numbers; what is missing becomes losses, so that all n are counted.
+
+        Args:
+            capture: of one radar.
+            segment: its number.
+            times: of the radar's start.
+            alone: frames that the radar made before the other one ran.
+            counts: radar -> frames given, kept up to date.
+        """
         radar, base = capture.radar, segment * self.frames
-        period_ns, absent = round(1e9 * self._period_s), self.frames - capture.total_frames
+        period_ns, absent = round(1e9 * self._period_s), self._recorded - capture.total_frames
         begin = 0
         if capture.board_start_ns is not None:
             begin = self._clocks[radar].missing(capture.board_start_ns, times.sent_ns, absent)
-        expected, t_ns = base, times.sent_ns
+        expected, t_ns = base, times.sent_ns + alone * period_ns
         for index, item in enumerate(capture):
             if isinstance(item, Pose):
                 continue
-            number = base + min(begin + item.number, absent + index)  # a late stamp is no frame more
+            number = min(begin + item.number, absent + index) - alone  # a late stamp is no frame more
+            if not 0 <= number < self.frames:
+                self.alone[radar] += 1
+                continue
+            number += base
             t_ns = begin * period_ns + (item.t_ns if isinstance(item, Loss) else item.t_first_chirp_ns)
             if number > expected:
                 detail = f"segment {segment}: numbers {expected}..{number - 1} were not recorded"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections import Counter
@@ -26,7 +27,7 @@ from edge.rig import Rig, load_rig
 from edge.sources.base import FrameSource, Loss
 from edge.sources.pairing import FramePairer
 from edge.sources.pose_feed import PoseFeed
-from edge.sources.segments import BoardClock, SegmentSource
+from edge.sources.segments import MARGIN_S, BoardClock, SegmentSource
 from edge.sources.ti_capture import DEVICES
 
 FRAMES = 5
@@ -41,11 +42,13 @@ def small_rig() -> Rig:
 
 RIG = small_rig()
 SCHEDULE = RIG.radars["horizontal"].schedule
+MARGIN = math.ceil(MARGIN_S / SCHEDULE.frame_period_s_actual)
 PERIOD_NS = round(SCHEDULE.frame_period_s_actual * 1e9)
 
 
-def samples(radar: RadarId, number: int) -> np.ndarray[Any, np.dtype[np.int16]]:
-    rng = np.random.default_rng((RADARS.index(radar), number))
+def samples(radar: RadarId, segment: int, index: int) -> np.ndarray[Any, np.dtype[np.int16]]:
+    """Of frame ``index`` of a recording."""
+    rng = np.random.default_rng((RADARS.index(radar), segment, index))
     return rng.integers(-2000, 2000, SCHEDULE.layout.shape, dtype=np.int16)
 
 
@@ -114,7 +117,7 @@ class Recorder:
         folder.mkdir(parents=True)
         base_us = (self.began_ns + self.born_ns) // 1000
         times_us = [base_us + k * PERIOD_NS // 1000 for k in have]
-        adc = np.stack([samples(self.radar, self.segment * FRAMES + k) for k in have])
+        adc = np.stack([samples(self.radar, self.segment, k) for k in have])
         for device, name in enumerate(DEVICES):
             data = adc[:, device].astype("<i2").tobytes()
             keep = len(data) - (100 if self.segment in self.cut else 0)
@@ -152,6 +155,19 @@ def read(source: SegmentSource) -> tuple[dict[RadarId, list[RadarFrame]], list[L
     return frames, losses
 
 
+def alone(source: SegmentSource, segment: int) -> int:
+    """Frames of the horizontal radar before the vertical one ran."""
+    start = source.reports[segment].start
+    assert start is not None
+    return (start.times["vertical"].sent_ns - start.times["horizontal"].sent_ns) // PERIOD_NS
+
+
+def recorded(source: SegmentSource, frame: RadarFrame) -> tuple[int, int]:
+    """Segment and index in its recording, of a frame that the source numbered."""
+    segment, index = divmod(frame.number, FRAMES)
+    return segment, index + (alone(source, segment) if frame.radar == "horizontal" else 0)
+
+
 def accounts(source: SegmentSource) -> dict[RadarId, tuple[int, dict[LossCause, int]]]:
     """Frames in and losses by the pairer that the pipeline uses."""
     pairer, found = FramePairer(RADARS), Counter[RadarId]()
@@ -176,7 +192,7 @@ def test_numbers_go_on_and_samples_are_those_of_the_boards(make: Make, tmp_path:
     assert losses == []
     for radar in RADARS:
         assert [frame.number for frame in frames[radar]] == list(range(2 * FRAMES))
-        assert all(np.array_equal(frame.adc, samples(radar, frame.number)) for frame in frames[radar])
+        assert all(np.array_equal(x.adc, samples(radar, *recorded(source, x))) for x in frames[radar])
         assert list((tmp_path / radar).iterdir()) == [], "a segment that was played is removed"
     assert [report.frames for report in source.reports] == [{"horizontal": FRAMES, "vertical": FRAMES}] * 2
     assert not any(report.text for report in source.reports)
@@ -194,25 +210,41 @@ def test_times_are_the_hosts_and_radar_two_is_half_a_period_later(make: Make) ->
         assert report.start is not None
         for radar in RADARS:
             own = [i.t_first_chirp_ns for i in items if i.radar == radar and i.number // FRAMES == segment]
-            assert own[0] == report.start.times[radar].sent_ns
+            before_ns = own[0] - report.start.times[radar].sent_ns
+            assert before_ns == pytest.approx(
+                PERIOD_NS * (alone(source, segment) if radar == "horizontal" else 0), abs=9e3
+            )
             assert np.abs(np.diff(own) - PERIOD_NS).max() <= 2000, "stamps of the board are whole microseconds"
         assert report.start.offset_s == pytest.approx(0.5e-9 * PERIOD_NS, abs=1e-7)
+    pairs = zip(*([i.t_first_chirp_ns for i in items if i.radar == radar] for radar in RADARS), strict=True)
+    assert all(b - a == pytest.approx(PERIOD_NS / 2, abs=1e4) for a, b in pairs), "frames of one number"
+    assert source.alone["horizontal"] == source.alone["vertical"] == 2 * MARGIN
 
 
 def test_missing_and_cut_frames_are_counted(make: Make) -> None:
     source, boards = make(segments=3)
-    boards["horizontal"].absent = {(0, 2), (1, 3), (1, 4)}
+    boards["vertical"].absent = {(0, 2), (1, 3), (1, 4)}
     boards["vertical"].cut = {2}
     frames, losses = read(source)
     found = [(x.radar, x.number, x.cause, x.count) for x in losses]
     assert found == [
-        ("horizontal", 2, LossCause.GAP, 1),
-        ("horizontal", FRAMES + 3, LossCause.GAP, 2),
-        ("vertical", 3 * FRAMES - 1, LossCause.TRUNCATED, 1),
+        ("vertical", 2, LossCause.GAP, 1),
+        ("vertical", FRAMES + 3, LossCause.GAP, 2),
     ]
     numbers = {radar: {frame.number for frame in frames[radar]} for radar in RADARS}
-    assert numbers["horizontal"] == set(range(3 * FRAMES)) - {2, FRAMES + 3, FRAMES + 4}
-    assert numbers["vertical"] == set(range(3 * FRAMES - 1))
+    assert numbers["vertical"] == set(range(3 * FRAMES)) - {2, FRAMES + 3, FRAMES + 4}
+    assert numbers["horizontal"] == set(range(3 * FRAMES))
+    assert all(np.array_equal(x.adc, samples("vertical", *recorded(source, x))) for x in frames["vertical"])
+
+
+def test_a_recording_that_ended_early(make: Make) -> None:
+    """A power cut leaves a half frame; what comes behind it was never recorded."""
+    source, boards = make(segments=1)
+    boards["vertical"].cut = {0}
+    boards["vertical"].absent = {(0, k) for k in range(3, FRAMES + MARGIN)}
+    _, losses = read(source)
+    found = [(x.radar, x.number, x.cause, x.count) for x in losses]
+    assert found == [("vertical", 2, LossCause.TRUNCATED, 1), ("vertical", 3, LossCause.GAP, FRAMES - 3)]
 
 
 def test_missing_first_frames_are_seen_by_the_boards_clock(make: Make) -> None:
@@ -220,7 +252,7 @@ def test_missing_first_frames_are_seen_by_the_boards_clock(make: Make) -> None:
     boards["vertical"].absent = {(1, 0), (1, 1)}
     frames, losses = read(source)
     assert [(x.radar, x.number, x.count) for x in losses] == [("vertical", FRAMES, 2)]
-    assert all(np.array_equal(frame.adc, samples("vertical", frame.number)) for frame in frames["vertical"])
+    assert all(np.array_equal(x.adc, samples("vertical", *recorded(source, x))) for x in frames["vertical"])
     own = {frame.number: frame.t_first_chirp_ns for frame in frames["vertical"]}
     start = source.reports[1].start
     assert start is not None
@@ -229,10 +261,10 @@ def test_missing_first_frames_are_seen_by_the_boards_clock(make: Make) -> None:
 
 def test_the_account_is_exact(make: Make) -> None:
     source, boards = make(segments=3)
-    boards["horizontal"].absent, boards["vertical"].broken = {(0, 1), (2, 4)}, {1}
+    boards["vertical"].absent, boards["vertical"].broken = {(0, 1), (2, 4)}, {1}
     assert accounts(source) == {
-        "horizontal": (3 * FRAMES, {LossCause.GAP: 2 + FRAMES}),
-        "vertical": (3 * FRAMES, {LossCause.GAP: FRAMES, LossCause.UNPAIRED: 2}),
+        "vertical": (3 * FRAMES, {LossCause.GAP: 2 + FRAMES}),
+        "horizontal": (3 * FRAMES, {LossCause.GAP: FRAMES, LossCause.UNPAIRED: 2}),
     }
 
 
@@ -300,7 +332,7 @@ def test_a_start_that_missed_is_recorded_again(make: Make, tmp_path: Path) -> No
     assert report.start.attempts == 2
     assert losses == []
     assert [frame.number for frame in frames["vertical"]] == list(range(FRAMES))
-    assert np.array_equal(frames["vertical"][0].adc, samples("vertical", FRAMES)), "of the second recording"
+    assert np.array_equal(frames["vertical"][0].adc, samples("vertical", 1, 0)), "of the second recording"
     assert list((tmp_path / "vertical").iterdir()) == [], "the first one is removed as well"
 
 
