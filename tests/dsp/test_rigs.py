@@ -73,9 +73,10 @@ def test_corridor_rig_sees_points_where_they_are():
 def test_single_chip_sees_points_where_they_are(name, which):
     """The compensation of the antenna pattern moves the maximum of an eight-element lobe by up to a bin outwards."""
     eye = Eye(name, which)
+    usable_m = eye.radar.schedule.profile.usable_range_m
     for range_m in RANGES_M:
         for cosine in (0.0, 0.3, -0.3, 0.6, -0.6, 0.7, -0.7):
-            eye.check(range_m, cosine)
+            eye.check(min(range_m, 0.95 * usable_m), cosine)
 
 
 @pytest.fixture(scope="module", params=["cascade_demo", "cascade_pair_fine"])
