@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same frames give the same digest: run after run, in two threads at once, in every pass, with one or two threads."""
+"""The same frames give the same digest: run after run, in two threads at once, in every pass, on one or two threads."""
 
 from __future__ import annotations
 
