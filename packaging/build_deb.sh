@@ -1,0 +1,88 @@
+#!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
+# Builds the Debian package: its own Python environment under /opt/rfconstruct, unit, udev rules, sysctl, tmpfiles, users.
+#
+#   packaging/build_deb.sh [--out DIR] [--python PYTHON] [--no-venv]
+#
+# --out      where the .deb goes (default: dist)
+# --python   interpreter with pip and hatchling; its minor version is that of the target (default: .venv/bin/python)
+# --no-venv  everything but the software, which takes minutes: to check the rest of the package
+set -eu
+
+fail() { echo "build_deb.sh: $*" >&2; exit 1; }
+
+top=$(cd "$(dirname "$0")/.." && pwd)
+out=$top/dist python=$top/.venv/bin/python venv=yes
+while [ $# -gt 0 ]; do
+    case $1 in
+        --out) out=$2; shift 2 ;;
+        --python) python=$2; shift 2 ;;
+        --no-venv) venv=no; shift ;;
+        *) fail "unknown option $1" ;;
+    esac
+done
+command -v dpkg-deb >/dev/null || fail "dpkg-deb is missing: apt-get install dpkg-dev"
+umask 022
+
+version=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$top/pyproject.toml" | head -n 1)
+architecture=$(dpkg --print-architecture)
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT INT TERM
+root=$work/root home=$work/root/opt/rfconstruct
+mkdir -p "$root/DEBIAN" "$home/bin" "$root/usr/bin"
+
+put() { # put MODE SOURCE TARGET
+    mkdir -p "$(dirname "$root$3")"
+    install -m "$1" "$top/$2" "$root$3"
+}
+put 0644 systemd/rfconstruct.service /usr/lib/systemd/system/rfconstruct.service
+put 0644 systemd/udev/60-rfconstruct.rules /usr/lib/udev/rules.d/60-rfconstruct.rules
+put 0644 systemd/sysctl/60-rfconstruct.conf /usr/lib/sysctl.d/60-rfconstruct.conf
+put 0644 systemd/tmpfiles/rfconstruct.conf /usr/lib/tmpfiles.d/rfconstruct.conf
+put 0644 systemd/sysusers/rfconstruct.conf /usr/lib/sysusers.d/rfconstruct.conf
+put 0644 packaging/debian/environment /etc/rfconstruct/environment
+put 0644 LICENSE /usr/share/doc/rfconstruct/copyright
+put 0644 docs/service.md /usr/share/doc/rfconstruct/service.md
+put 0644 docs/wire_format.md /usr/share/doc/rfconstruct/wire_format.md
+ln -s /opt/rfconstruct/bin/rfconstruct "$root/usr/bin/rfconstruct"
+
+python_minor=11
+if [ "$venv" = yes ]; then
+    python_minor=$("$python" -c 'import sys; print(sys.version_info.minor)')
+    pip() { "$python" -m pip --quiet --disable-pip-version-check "$@"; }
+    pip wheel --no-deps --no-build-isolation --wheel-dir "$work/wheel" "$top"
+    "$python" -m venv --without-pip "$home"
+    pip --python "$home/bin/python" install --no-compile --requirement "$top/requirements/edge.txt"
+    pip --python "$home/bin/python" install --no-compile --no-deps "$work"/wheel/*.whl
+    # What was built in $root will lie in /: its interpreter is the system's, its paths begin at the root.
+    for link in python python3; do ln -sfn "/usr/bin/python3.$python_minor" "$home/bin/$link"; done
+    rm -f "$home/bin/python3.$python_minor" "$home/bin/"[Aa]ctivate*
+    sed -i "1s|^#!.*python.*|#!/opt/rfconstruct/bin/python|" "$home/bin/rfconstruct"
+    find "$home/bin" -type f ! -name rfconstruct -delete
+    printf 'home = /usr/bin\ninclude-system-site-packages = false\nversion = 3.%s\n' "$python_minor" >"$home/pyvenv.cfg"
+    "$python" -m compileall -q -s "$root" -p / "$home" >/dev/null || fail "a module does not compile"
+else
+    printf '#!/bin/sh\necho "rfconstruct: this package was built with --no-venv" >&2\nexit 1\n' >"$home/bin/rfconstruct"
+    chmod 0755 "$home/bin/rfconstruct"
+fi
+if grep -rIl -- "$work" "$root" | grep -q .; then fail "the package holds paths of this machine"; fi
+
+for script in postinst prerm postrm; do install -m 0755 "$top/packaging/debian/$script" "$root/DEBIAN/$script"; done
+echo /etc/rfconstruct/environment >"$root/DEBIAN/conffiles"
+(cd "$root" && find . -path ./DEBIAN -prune -o -type f -printf '%P\0' | sort -z | xargs -0 md5sum) >"$root/DEBIAN/md5sums"
+cat >"$root/DEBIAN/control" <<CONTROL
+Package: rfconstruct
+Version: $version
+Architecture: $architecture
+Maintainer: RFconstruct maintainers <maintainers@rfconstruct.invalid>
+Installed-Size: $(du -sk --exclude=DEBIAN "$root" | cut -f 1)
+Depends: python3 (>= 3.$python_minor), python3 (<< 3.$((python_minor + 1))), systemd, udev, libusb-1.0-0
+Recommends: openssh-client
+Section: science
+Priority: optional
+Description: 3-D shapes of road users from two orthogonal 77 GHz radars
+ Reads raw frames of two radar boards, detects, fuses and completes objects,
+ and publishes their shapes over ZeroMQ. Runs as a hardened service.
+CONTROL
+mkdir -p "$out"
+dpkg-deb --root-owner-group -Zxz -z3 --build "$root" "$out/rfconstruct_${version}_$architecture.deb"
