@@ -89,6 +89,29 @@ class Sink(Protocol):
         """One window of travel is done."""
 
 
+class Road(Protocol):
+    """What this pipeline and the live one (``edge.service.live``) have to show."""
+
+    @property
+    def rig(self) -> Rig:
+        """Radars, geometry and settings."""
+
+    @property
+    def ledgers(self) -> Mapping[RadarId, FrameLedger]:
+        """Radar id -> account of its frames."""
+
+    @property
+    def times(self) -> StageTimes:
+        """Of the stages."""
+
+    @property
+    def faults(self) -> Faults:
+        """What went wrong apart from lost frames."""
+
+    def rehearse(self, frames: Mapping[RadarId, RadarFrame]) -> None:
+        """Image and detect frames that count nowhere."""
+
+
 class Pipeline:
     """All stages of one rig in one thread.
 

@@ -72,7 +72,7 @@ def play(
         stopped: asked before every item; True leaves the rest of the source.
     """
     pace = Pace(speed, idle, stopped)
-    with _progress(total, show_progress) as bar:
+    with progress(total, show_progress) as bar:
         for item in source:
             if not isinstance(item, Loss):
                 pace.wait(item.t_ns if isinstance(item, Pose) else item.t_first_chirp_ns)
@@ -84,7 +84,8 @@ def play(
         pipeline.finish()
 
 
-def _progress(total: int | None, wanted: bool) -> Any:
+def progress(total: int | None, wanted: bool) -> Any:
+    """A bar of frames on a terminal's stderr; hidden elsewhere."""
     from tqdm import tqdm
 
     hidden = not wanted or sys.stderr is None or not sys.stderr.isatty()

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from edge.errors import WireError
-from edge.pipeline import FrameResult, Pipeline, WindowResult
+from edge.frames import Shape
+from edge.pipeline import FrameResult, Road, WindowResult
 from edge.stream.messages import LEVELS, RadarStatus, Reason, State, Status
 from edge.stream.publisher import Publisher
 from edge.stream.wire import STATUS_HZ
@@ -26,7 +27,8 @@ class PublishingSink:
 
     def __init__(self, publisher: Publisher, version: str) -> None:
         self._publisher, self._version = publisher, version
-        self._pipeline: Pipeline | None = None
+        self._pipeline: Road | None = None
+        self._live: Callable[[State | None], Status] | None = None
         self._start_s = time.monotonic()
         self._reasons: dict[str, tuple[int, int, int]] = {}
         """Code -> count, first and last instant."""
@@ -34,9 +36,15 @@ class PublishingSink:
         self._latency_us: dict[str, tuple[float, float, float]] = {}
         self._latency_due_s = 0.0
 
-    def watch(self, pipeline: Pipeline) -> None:
-        """Take the status message's counters from this pipeline."""
-        self._pipeline = pipeline
+    def watch(self, pipeline: Road, live: Callable[[State | None], Status] | None = None) -> None:
+        """Take the status message's counters from this pipeline.
+
+        Args:
+            pipeline: whose counters.
+            live: makes the whole status of a live pipeline, in its own state or in the one it is given; ``frame`` then
+                gives no signs of life, since the live pipeline calls ``report`` by itself.
+        """
+        self._pipeline, self._live = pipeline, live
 
     def frame(self, result: FrameResult) -> None:
         """Publish one frame's results, and the sign of life when it is due."""
@@ -46,13 +54,22 @@ class PublishingSink:
         self._send(publisher.detections, found.get("horizontal"), found.get("vertical"), result.cloud)
         if result.pose is not None:
             self._send(publisher.pose, result.pose)
-        self.report()
+        if self._live is None:
+            self.report()
 
     def window(self, result: WindowResult) -> None:
         """Publish a fused window and its shapes."""
         self._send(self._publisher.cloud, result.cloud)
         for shape in result.shapes:
-            self._send(self._publisher.shape, shape)
+            self.shape(shape)
+
+    def shape(self, shape: Shape) -> None:
+        """Publish a shape."""
+        self._send(self._publisher.shape, shape)
+
+    def counts(self) -> dict[str, int]:
+        """What could not be sent, by reason code."""
+        return {"NOT_SENT": self._unsent}
 
     def invite(self, duration_s: float) -> None:
         """Give signs of life until waiting subscribers have joined: what is published before that is lost for them."""
@@ -78,10 +95,11 @@ class PublishingSink:
             done.set()
             thread.join()
 
-    def report(self, state: State = "RUN") -> None:
-        """Heartbeat and status, as far as they are due."""
-        self._publisher.heartbeat(state)
-        self._publisher.status(self._status(state))
+    def report(self, state: State | None = None) -> None:
+        """Heartbeat and status, as far as they are due; without ``state`` that of the live pipeline, or RUN."""
+        status = self._status(state or "RUN") if self._live is None else self._live(state)
+        self._publisher.heartbeat(status.state)
+        self._publisher.status(status)
 
     def _send(self, send: Callable[..., object], *content: object) -> None:
         """Publish; what the wire format cannot express is counted."""
@@ -92,7 +110,7 @@ class PublishingSink:
             if self._pipeline is not None:
                 self._pipeline.faults.last = str(error)
 
-    def _latencies(self, pipeline: Pipeline) -> dict[str, tuple[float, float, float]]:
+    def _latencies(self, pipeline: Road) -> dict[str, tuple[float, float, float]]:
         """Percentiles, not computed more often than they are published."""
         now_s = time.monotonic()
         if now_s >= self._latency_due_s:
@@ -126,7 +144,7 @@ class PublishingSink:
             uptime_s=uptime_s,
         )
 
-    def _update_reasons(self, pipeline: Pipeline) -> tuple[Reason, ...]:
+    def _update_reasons(self, pipeline: Road) -> tuple[Reason, ...]:
         """One reason for every cause of loss and every fault that has occurred."""
         counts: dict[str, int] = {}
         for ledger in pipeline.ledgers.values():

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from edge.frames import Pose, RadarFrame, RadarId
-from edge.pipeline import Pipeline
+from edge.pipeline import Pipeline, Road
 from edge.rig import Rig
 from edge.warm_frames import noise_frames
 
@@ -17,7 +17,7 @@ P_FA = 0.05
 """Enough false alarms to have detections, pairs and points."""
 
 
-def warm_up(rig: Rig, pipeline: Pipeline | None = None) -> dict[str, float]:
+def warm_up(rig: Rig, pipeline: Road | None = None) -> dict[str, float]:
     """Run a few frames of noise through a pipeline of their own, then rehearse the one that will be used.
 
     Args:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rfconstruct bench``: stages and the whole two-radar frame beside their peers in the same process."""
+"""``rfconstruct bench``: stages and the whole frame beside their peers in one process; ``--soak``: endurance."""
 
 from __future__ import annotations
 
@@ -20,6 +20,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rig", default="cascade_demo", help="rig with two cascades (default: %(default)s)")
     parser.add_argument("--seconds", type=seconds, default=20.0, help="time to spend measuring (default: %(default)s)")
     parser.add_argument("--cold", action="store_true", help="also measure a start that compiles all kernels (20 s)")
+    parser.add_argument(
+        "--soak", type=seconds, metavar="S", help="instead: so long through the live pipeline, in real time"
+    )
+    parser.add_argument("--recording", type=Path, metavar="FILE", help="drive to play with --soak (default: simulated)")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there, too")
 
 
@@ -27,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print tables, or JSON."""
     for variable in ONE_THREAD:
         os.environ.setdefault(variable, "1")
+    if args.soak is not None:
+        return _soak(args)
     from edge.bench.report import document, lines
     from edge.bench.suite import run_suite
     from edge.frames import RADARS
@@ -45,3 +51,29 @@ def run(args: argparse.Namespace) -> int:
         command = f"rfconstruct bench --rig {rig.name} --seconds {args.seconds:g}{cold} --markdown {args.markdown}"
         args.markdown.write_text(document(result, command), encoding="utf-8")
     return ExitCode.OK
+
+
+def _soak(args: argparse.Namespace) -> int:
+    """A drive again and again; exit code 3 when a figure is beyond its limit."""
+    from edge.bench.soak import lines, missed, soak
+    from edge.bench.soak_drive import soak_recording
+    from edge.commands.interrupts import Interrupts
+    from edge.commands.session import load_model
+    from edge.recording.reader import RecordingReader
+    from edge.rig import load_rig
+
+    if args.recording is not None:
+        path = args.recording
+        with RecordingReader(path) as reader:
+            rig = reader.read_rig()
+    else:
+        rig = load_rig(args.rig)
+        path = soak_recording(rig)
+    model, notes = load_model(rig)
+    interrupts = Interrupts()
+    with interrupts:
+        result = soak(rig, path, args.soak, model, "; ".join(notes), interrupts.asked)
+    print(json.dumps(result, indent=2) if args.json else "\n".join(lines(result)))
+    if interrupts.asked():
+        return interrupts.exit_code
+    return ExitCode.DEGRADED if missed(result) else ExitCode.OK

@@ -28,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--loop", type=arguments.passes, default=1, metavar="N", help="play N times, 0 = for ever; numbers go on rising"
     )
+    parser.add_argument(
+        "--live", action="store_true", help="on the live pipeline's threads, shapes while they are seen"
+    )
     parser.add_argument("--digest", action="store_true", help="SHA-256 over detections, points and shapes")
 
 
@@ -37,6 +40,12 @@ def run(args: argparse.Namespace) -> int:
     Ctrl-C and SIGTERM end the run in order: account printed, exit code 130 or 143.
     """
     path: Path = args.recording
+    if args.live and (args.speed <= 0 or args.digest):
+        raise ConfigError(
+            "--live drops what it cannot follow: it needs a speed, and gives no digest",
+            value="--digest" if args.digest else "--speed max",
+            action="leave --live out",
+        )
     part = Part(args.start, args.end, args.loop)
     if path.is_dir():
         if not part.whole or part.loops != 1:
@@ -44,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         rig = rig_of(args)
         source, notes = open_capture(path, rig)
         with closing(source):
-            run = session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes)
+            run = session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes, live=args.live)
             return _play(run, source, args.digest)
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording", action="give an .mcap file or a capture folder")
@@ -55,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         notes = list(reader.notes)
         if reader.truncated:
             notes.append(f"{path}: its end is missing; played up to the last whole record")
-        run = session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes)
+        run = session.Session(rig, args, "replay", f"{path.name}, rig {rig.name}", notes, live=args.live)
         return _play(run, Playback(reader, part), args.digest, reader)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from edge.best_shapes import class_text, keep_best
 from edge.frames import Shape
-from edge.pipeline import FrameResult, Pipeline, WindowResult
+from edge.pipeline import FrameResult, Road, WindowResult
 from edge.stream.convert import shape_size_m
 
 
@@ -32,7 +32,11 @@ class Tally:
         """Count a window, keep its shapes."""
         self.windows += 1
         for shape in result.shapes:
-            keep_best(self.shapes, shape)
+            self.shape(shape)
+
+    def shape(self, shape: Shape) -> None:
+        """Keep the most trusted shape of every object."""
+        keep_best(self.shapes, shape)
 
 
 class Narrator:
@@ -51,6 +55,13 @@ class Narrator:
         for shape in result.shapes:
             tqdm.write(f"shape:  {_shape_line(shape)}")
 
+    def shape(self, shape: Shape) -> None:
+        """Print the final shape of an object; the live pipeline gives several a second before it."""
+        from tqdm import tqdm
+
+        if shape.input.final:
+            tqdm.write(f"shape:  {_shape_line(shape)}")
+
 
 def shape_as_dict(shape: Shape) -> dict[str, Any]:
     """A shape without its points."""
@@ -66,7 +77,7 @@ def shape_as_dict(shape: Shape) -> dict[str, Any]:
     }
 
 
-def as_dict(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: Sequence[str]) -> dict[str, Any]:
+def as_dict(pipeline: Road, tally: Tally, pictures: Sequence[Path], notes: Sequence[str]) -> dict[str, Any]:
     """The whole report for machines."""
     return {
         "rig": pipeline.rig.name,
@@ -82,7 +93,7 @@ def as_dict(pipeline: Pipeline, tally: Tally, pictures: Sequence[Path], notes: S
     }
 
 
-def lines(pipeline: Pipeline, tally: Tally, notes: Sequence[str]) -> list[str]:
+def lines(pipeline: Road, tally: Tally, notes: Sequence[str]) -> list[str]:
     """The whole report for people."""
     text = [f"{'radar':<12}{'frames in':>10}{'ok':>8}{'lost':>8}  causes"]
     for radar, ledger in pipeline.ledgers.items():
@@ -102,7 +113,7 @@ def lines(pipeline: Pipeline, tally: Tally, notes: Sequence[str]) -> list[str]:
     return text
 
 
-def _dead(pipeline: Pipeline) -> dict[str, tuple[str, ...]]:
+def _dead(pipeline: Road) -> dict[str, tuple[str, ...]]:
     return {radar: names for radar, names in pipeline.faults.dead_channels.items() if names}
 
 

@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
         return _dry_run({radar: board.plan() for radar, board in boards.items()}, args.json)
     limits = _limits(args, rig)
     with ExitStack() as stack:
-        live = session.Session(rig, args, "live", f"rig {rig.name}")
+        segments = any(isinstance(board, CascadeDriver) for board in boards.values())
+        live = session.Session(rig, args, "live", f"rig {rig.name}", live=True, patient=segments)
         for board in boards.values():
             stack.callback(board.close)
         poses = _poses(rig, live, stack)

@@ -20,10 +20,13 @@ from edge.completion.model import CompletionModel
 from edge.errors import ExitCode
 from edge.frames import RADARS, Float32, Pose, RadarFrame
 from edge.pipeline import Pipeline, Sink
-from edge.player import play
+from edge.player import play, progress
 from edge.plot.collector import PictureCollector
 from edge.publish import PublishingSink
 from edge.rig import Rig
+from edge.service.live import LivePipeline
+from edge.service.observer import Observer
+from edge.service.serve import paced, serve
 from edge.sources.base import Loss
 from edge.stream.publisher import Publisher
 from edge.stream.wire import Source
@@ -68,6 +71,10 @@ class Session:
         title: line under every picture's title.
         notes: what a reader of the results should know.
         truth_odom_m: float32 [n, 3] of the true object, simulated scenes only.
+        live: on the live pipeline's threads instead of all in one.
+        patient: the live pipeline waits instead of dropping: for a source that is faster than its frames were.
+    Attributes:
+        observer: of the live pipeline; None: it is not live.
     """
 
     def __init__(
@@ -78,6 +85,9 @@ class Session:
         title: str,
         notes: Sequence[str] = (),
         truth_odom_m: Float32 | None = None,
+        *,
+        live: bool = False,
+        patient: bool = False,
     ) -> None:
         self.rig, self.tally, self.notes = rig, Tally(), list(notes)
         self._args, self._stack, self._interrupts = args, ExitStack(), Interrupts()
@@ -89,12 +99,27 @@ class Session:
         if args.plot is not None:
             self._pictures = PictureCollector(args.plot, title, truth_odom_m, rig.settings.association.fov_deg)
             sinks.append(self._pictures)
-        self.pipeline = Pipeline(rig, model, sinks)
-        self._publishing: PublishingSink | None = None
-        if not args.no_publish:
-            self._publishing = self._publisher(source_kind)
-            self._publishing.watch(self.pipeline)
-            self.pipeline.sinks.append(self._publishing)
+        self._publishing = None if args.no_publish else self._publisher(source_kind)
+        if self._publishing is not None:
+            sinks.append(self._publishing)
+        self.observer: Observer | None = None
+        self.pipeline: Pipeline | LivePipeline
+        if live:
+            self.pipeline = LivePipeline(rig, model, sinks, no_shapes="; ".join(more), patient=patient)
+            self.observer = self._observe(self.pipeline)
+        else:
+            self.pipeline = Pipeline(rig, model, sinks)
+            if self._publishing is not None:
+                self._publishing.watch(self.pipeline)
+
+    def _observe(self, pipeline: LivePipeline) -> Observer:
+        publishing = self._publishing
+        counts = None if publishing is None else publishing.counts
+        observer = Observer(pipeline, {"rfconstruct": version()}, counts=counts)
+        if publishing is not None:
+            publishing.watch(pipeline, observer.status)
+            pipeline.beats.append(publishing.report)
+        return observer
 
     def _publisher(self, kind: Source) -> PublishingSink:
         settings = self.rig.settings.stream
@@ -112,7 +137,7 @@ class Session:
 
     def stopped(self) -> bool:
         """Whether Ctrl-C or SIGTERM came; gives a sign of life when one is due."""
-        if self._publishing is not None and self._running:
+        if self._publishing is not None and self._running and self.observer is None:
             self._publishing.report()
         return self._interrupts.asked()
 
@@ -139,13 +164,29 @@ class Session:
                 self._running = True
                 if publishing is not None and not asked():
                     publishing.invite(JOIN_S)
-                play(source, self.pipeline, self._args.speed, total, not self._args.json, idle, asked)
+                if isinstance(self.pipeline, Pipeline):
+                    play(source, self.pipeline, self._args.speed, total, not self._args.json, idle, asked)
+                elif self.observer is not None:
+                    self._serve(source, total, self.pipeline, self.observer)
             finally:
                 self._running = False
                 if publishing is not None:
                     publishing.report("STOP")
         if self._interrupts.received is not None:
             self.notes.append(f"ended by {self._interrupts.received.name}: the rest was not played")
+
+    def _serve(
+        self, source: Iterable[RadarFrame | Pose | Loss], total: int | None, pipeline: LivePipeline, observer: Observer
+    ) -> None:
+        """Play the source through the live pipeline."""
+        asked = self._interrupts.asked
+        with progress(total, not self._args.json) as bar:
+
+            def taken(item: RadarFrame | Pose | Loss) -> None:
+                if not isinstance(item, Pose):
+                    bar.update(item.count if isinstance(item, Loss) else 1)
+
+            serve(paced(source, self._args.speed, asked), pipeline, observer, asked, taken)
 
     def _warm_up(self, prepare: Callable[[], None] | None) -> None:
         start_s = time.monotonic()

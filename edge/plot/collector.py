@@ -47,7 +47,7 @@ class PictureCollector:
     def frame(self, result: FrameResult) -> None:
         """Keep a copy of the heatmaps when no earlier frame had more detections."""
         count = sum(map(len, result.detections.values()))
-        if self._best is None or count > self._best[0]:
+        if len(result.heatmaps) == len(result.detections) and (self._best is None or count > self._best[0]):
             copies = {radar: copy_heatmap(heatmap) for radar, heatmap in result.heatmaps.items()}
             self._best = (count, copies, dict(result.detections))
         if result.pose is not None and len(self._frames) < MAX_KEPT_FRAMES:
@@ -60,7 +60,11 @@ class PictureCollector:
             self._window = (result.cloud, [entry for entry in inside if entry[0].t_ns <= result.cloud.t_end_ns])
         self._frames = inside
         for shape in result.shapes:
-            keep_best(self._shapes, shape)
+            self.shape(shape)
+
+    def shape(self, shape: Shape) -> None:
+        """Keep the most trusted shape of every object."""
+        keep_best(self._shapes, shape)
 
     def write(self) -> list[Path]:
         """Write all pictures that there is something for; returns their paths."""

@@ -61,6 +61,7 @@ class LivePipeline:
         patient: ``feed`` waits while the pipeline is full: for sources that give frames faster than they were taken,
             such as segments. Nothing is shed then.
         imaging: radar id -> imager and detector that were made before; None: made here.
+        times: takes the stages' times; None: made here.
     Attributes:
         beats: called again and again by the sinks' thread: signs of life.
         shedder: decides what is left out (asked by ``edge.service.observer``).
@@ -75,11 +76,12 @@ class LivePipeline:
         no_shapes: str = "",
         patient: bool = False,
         imaging: Mapping[RadarId, tuple[Imager, Detector]] | None = None,
+        times: SharedTimes | None = None,
     ) -> None:
         self.rig, self.sinks, self.patient = rig, list(sinks), patient
         self.no_shapes = no_shapes if completion is None and no_shapes else ("" if completion else "no model is loaded")
         self.beats: list[Callable[[], None]] = []
-        self.times, self.faults, self.shedder = SharedTimes(), Faults(), LoadShedder()
+        self.times, self.faults, self.shedder = times or SharedTimes(), Faults(), LoadShedder()
         self.gate = PairGate(rig, self.faults)
         self.radars = self.gate.radars
         self.ledgers: dict[RadarId, FrameLedger] = self.gate.ledgers
@@ -99,15 +101,15 @@ class LivePipeline:
         self._arrived_ns: dict[int, int] = {}
         self._shown_ns: int | None = None
         self._feeding, self._ended = threading.Lock(), False
-        self._imagers = [
-            Stage(f"image-{radar}", partial(self.pairs.take, radar), partial(self._image, radar),
-                  partial(self._image_failed, radar))
-            for radar in self.radars
-        ]  # fmt: skip
-        self._fusing = Stage("fusion", self.imaged.take, self._fuse, self._fuse_failed)
-        self._completing = Stage("completion", self.asked.take, self._complete, self._complete_failed)
-        self._sending = Stage("sinks", self.outbox.take, self._deliver, self._deliver_failed, self._beat, BEAT_S)
-        self._started = False
+        self._imagers = [self._imager(radar) for radar in self.radars]
+        self._fusing = Stage[Job]("fusion", self.imaged.take, self._fuse, self._fuse_failed)
+        self._completing = Stage[tuple[ObjectCloud, int]](
+            "completion", self.asked.take, self._complete, self._complete_failed
+        )
+        self._sending = Stage[Result](
+            "sinks", self.outbox.take, self._deliver, self._deliver_failed, self._beat, BEAT_S
+        )
+        self._started, self._beaten_s = False, 0.0
 
     @property
     def stages(self) -> tuple[Stage[Job] | Stage[tuple[ObjectCloud, int]] | Stage[Result], ...]:
@@ -198,6 +200,10 @@ class LivePipeline:
         pending = sum(ledger.snapshot().pending for ledger in self.ledgers.values())
         dispatched = len(self.book) * len(self.radars)
         return {"waiting for partner or pose": max(pending - dispatched, 0), "in the stages": dispatched}
+
+    def _imager(self, radar: RadarId) -> Stage[Job]:
+        work, failed = partial(self._image, radar), partial(self._image_failed, radar)
+        return Stage[Job](f"image-{radar}", partial(self.pairs.take, radar), work, failed)
 
     def _dispatch(self, ready: ReadyPair) -> None:
         pair, step = ready.pair, self.shedder.step
@@ -308,6 +314,11 @@ class LivePipeline:
         self._note(error)
 
     def _beat(self) -> None:
+        """Signs of life, however fast results come."""
+        now_s = time.monotonic()
+        if now_s - self._beaten_s < BEAT_S:
+            return
+        self._beaten_s = now_s
         for beat in self.beats:
             beat()
 

@@ -208,7 +208,7 @@ class _Rates:
         """Renew the figures when they are a second old."""
         if self._before is not None and now_ns - self._before[0] < RATE_S * 1e9:
             return
-        frames = {radar: ledger.snapshot().frames_ok for radar, ledger in pipeline.ledgers.items()}
+        frames: dict[str, int] = {radar: ledger.snapshot().frames_ok for radar, ledger in pipeline.ledgers.items()}
         usage = resource.getrusage(resource.RUSAGE_SELF)
         cpu_s = usage.ru_utime + usage.ru_stime
         if self._before is not None:
@@ -222,4 +222,4 @@ class _Rates:
         if heat_c is not None:
             self.system["temp_c"] = heat_c
         self.summary = pipeline.times.summary()
-        self._before = (now_ns, dict(frames), pipeline.poses.count, cpu_s)
+        self._before = (now_ns, frames, pipeline.poses.count, cpu_s)

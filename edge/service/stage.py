@@ -30,6 +30,7 @@ class Stage(threading.Thread, Generic[T]):
     Attributes:
         handled: items done, failed ones included.
         failures: items whose work raised.
+        cpu_s: processor time of the thread up to its last item.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Stage(threading.Thread, Generic[T]):
         self._take_next, self._work, self._failed, self._idle = take, work, failed, idle
         self._poll_s, self._ending = poll_s, threading.Event()
         self.handled = self.failures = 0
+        self.cpu_s = 0.0
         self._busy_since_s: float | None = None
 
     @property
@@ -84,6 +86,7 @@ class Stage(threading.Thread, Generic[T]):
         finally:
             self._busy_since_s = None
             self.handled += 1
+            self.cpu_s = time.thread_time()
 
     def _guard(self, call: Callable[[], None]) -> None:
         try:

@@ -128,7 +128,7 @@ def test_everything_is_fed_in_order_and_the_bar_ends_at_the_total(
     loss = Loss("horizontal", 1, LossCause.TRUNCATED, "cut", 0, 3)
     pose = Pose(6 * NS, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     bar = Bar()
-    monkeypatch.setattr(player, "_progress", lambda total, wanted: bar)
+    monkeypatch.setattr(player, "progress", lambda total, wanted: bar)
     recorder: Any = Recorder()
     play([frame, loss, pose], recorder, 1.0, total=4)
     assert recorder.fed == [frame, loss, pose, "finish"]
