@@ -230,8 +230,12 @@ def _image(board: CascadeBoard, rig: Rig) -> str:
 
 
 def _configured(driver: CascadeDriver) -> str:
-    notes = driver.configure(lambda what, done, of: None)
-    return "; ".join(notes)
+    """Set up; chips that report the same are named together."""
+    alike: dict[str, list[str]] = {}
+    for note in driver.configure(lambda what, done, of: None):
+        head, _, report = note.partition(": ")
+        alike.setdefault(re.sub(r", die [0-9a-f]+", "", report), []).append(head.rpartition(", ")[2])
+    return "; ".join(f"{', '.join(names)}: {report}" for report, names in alike.items())
 
 
 def _ports(board: CaptureCardBoard) -> str:
