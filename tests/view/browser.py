@@ -102,7 +102,9 @@ def browser(folder: Path, width: int = 1600, height: int = 900) -> Iterator[Brow
             tab = next(tab for tab in json.load(answer) if tab["type"] == "page")
         with connect(tab["webSocketDebuggerUrl"], max_size=None, open_timeout=CALL_S, compression=None) as link:
             one = Browser(link)
-            one.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+            one.call(
+                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+            )
             yield one
     finally:
         process.terminate()
