@@ -8,7 +8,7 @@ import json
 import math
 import tempfile
 from collections.abc import Generator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from edge.commands import arguments, session
@@ -17,7 +17,7 @@ from edge.commands.live_road import CardRoad, Limits, Road, SegmentRoad
 from edge.commands.open_source import calibrated
 from edge.drivers.single_chip import SingleChipDriver
 from edge.drivers.tda2.cascade import CascadeDriver
-from edge.errors import ExitCode
+from edge.errors import DeviceError, ExitCode, PoseError, RfconstructError
 from edge.frames import RADARS, LossCause, Pose, RadarFrame
 from edge.odometry.source import PoseEvent, make_pose_source
 from edge.rig import Rig, load_rig
@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Configure, start, play, report.
 
-    Exit code 3 when frames were lost by the hardware, bursts met, or nothing came; 4 when a board cannot be used.
+    Exit code 3 when frames were lost by the hardware, bursts met, or nothing came; 4 when a board cannot be used, or
+    not any more: then what came before is processed and reported.
     Ctrl-C and SIGTERM end the run in order: boards stopped, account printed, exit code 130 or 143.
     """
     rig = calibrated(load_rig(args.rig, args.boards), args.calibration)
@@ -68,25 +69,36 @@ def run(args: argparse.Namespace) -> int:
             road = SegmentRoad(rig, cascades, limits, folder, args.keep, poses, live)
         else:
             road = CardRoad(rig, singles, limits, poses, live)
-        items = _items(road, live)
-        stack.callback(items.close)
+        broken: list[RfconstructError] = []
+        items = _items(road, live, broken)
         live.run(items, road.total_frames, road.prepare)
-        items.close()
-        live.notes += road.finish()
-    return _report(live, road)
+        with suppress(ValueError):  # left behind in a call to a board that does not return
+            items.close()
+        live.notes += [*road.finish(), *(str(error) for error in broken)]
+    code = _report(live, road)
+    return code if not broken or code > ExitCode.BAD_MODEL else broken[0].exit_code
 
 
-def _items(road: Road, live: session.Session) -> Generator[RadarFrame | Pose | Loss, None, None]:
-    """What the pipeline takes; a new odometry frame closes its window."""
-    for item in road.items():
-        if not isinstance(item, PoseEvent):
-            yield item
-            continue
-        live.say(f"poses: {item.detail}")
-        if item.new_frame:
-            live.pipeline.new_pose_frame()
-        if item.kind in ("silent", "died", "doubtful"):
-            live.notes.append(f"poses {item.kind}: {item.detail}")
+def _items(
+    road: Road, live: session.Session, broken: list[RfconstructError]
+) -> Generator[RadarFrame | Pose | Loss, None, None]:
+    """What the pipeline takes; a new odometry frame closes its window.
+
+    A board or pose sensor that ends the run goes to ``broken``: what came before it is still processed and reported.
+    """
+    try:
+        for item in road.items():
+            if not isinstance(item, PoseEvent):
+                yield item
+                continue
+            live.say(f"poses: {item.detail}")
+            if item.new_frame:
+                live.pipeline.new_pose_frame()
+            if item.kind in ("silent", "died", "doubtful"):
+                live.notes.append(f"poses {item.kind}: {item.detail}")
+    except (DeviceError, PoseError) as error:
+        live.say(f"the run ends: {error}")
+        broken.append(error)
 
 
 def _poses(rig: Rig, live: session.Session, stack: ExitStack) -> PoseFeed | None:

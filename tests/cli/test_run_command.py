@@ -8,6 +8,8 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +93,19 @@ def test_no_board_there(tmp_path: Path) -> None:
     assert outcome.json["error"]["action"]
 
 
+def test_a_board_that_dies_for_good(tmp_path: Path) -> None:
+    """Set up anew three times in vain; the frames before are in the account, which is printed."""
+    with virtual_boards("awr1843_pair", tmp_path) as virtual:
+        watcher = threading.Thread(target=when_frames_run, args=(virtual, lambda: virtual.parts.unplug("vertical")))
+        watcher.start()
+        outcome = rfconstruct("run", "--rig", "awr1843_pair", "--boards", virtual.boards, "--no-publish")
+        watcher.join()
+    assert outcome.code == ExitCode.NO_HARDWARE
+    assert "the run ends" in outcome.out
+    assert "frames in" in outcome.out
+    assert "vertical" in outcome.out.partition("the run ends")[2]
+
+
 def test_two_boards_at_one_address(tmp_path: Path) -> None:
     boards = tmp_path / "boards.toml"
     boards.write_text('[radars.vertical.board]\naddress = "192.168.33.180"\n')
@@ -102,7 +117,8 @@ def test_two_boards_at_one_address(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["awr1843_pair", pytest.param("cascade_pair", marks=pytest.mark.slow)])
 def test_an_interrupt_ends_the_run_in_order(name: str, tmp_path: Path) -> None:
     with virtual_boards(name, tmp_path, segment_frames=120) as virtual:
-        watcher = threading.Thread(target=interrupt_when_frames_run, args=(virtual,))
+        interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
+        watcher = threading.Thread(target=when_frames_run, args=(virtual, interrupt))
         watcher.start()
         outcome = rfconstruct("run", "--rig", name, "--boards", virtual.boards, "--no-publish")
         watcher.join()
@@ -114,12 +130,12 @@ def test_an_interrupt_ends_the_run_in_order(name: str, tmp_path: Path) -> None:
     assert "frames in" in outcome.out
 
 
-def interrupt_when_frames_run(virtual: Virtual) -> None:
+def when_frames_run(virtual: Virtual, act: Callable[[], object]) -> None:
     parts = [*virtual.parts.radars.values(), *virtual.parts.boards.values()]
     end_s = time.monotonic() + 250.0
     while not all(part.bursts > 20 for part in parts) and time.monotonic() < end_s:
         time.sleep(0.02)
-    os.kill(os.getpid(), signal.SIGINT)
+    act()
 
 
 def test_boards_file_of_the_virtual_rig(tmp_path: Path) -> None:
