@@ -18,7 +18,6 @@ from edge.errors import ConfigError, ExitCode, RecordingError
 from edge.recording.reader import RecordingReader
 from edge.rig import load_rig
 from edge.stream.client import DEFAULT_ENDPOINT, Client, connect
-from edge.view.digest import Digest, copy_results, run_pipeline
 from edge.view.health import STALE_S, Banner
 from edge.view.page import DEFAULT_PORT, HOST, Page
 from edge.view.playback import Player
@@ -70,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
             player = Player(store)
             page = stack.enter_context(closing(Page(args.port, f"RFconstruct, {args.recording.name}", player)))
             _announce(page, args)
+            from edge.view.digest import Digest  # it brings the pipeline, which a live view does not need
+
             digest = Digest(store, _filler(reader, store, args))
             stack.callback(digest.stop)
             watch_recording(page, store, player, args.recording.name, stopped)
@@ -191,6 +192,8 @@ def _filler(
     """The work that fills the store: recorded results, or the pipeline when there are raw frames only."""
 
     def fill(stopped: Callable[[], bool]) -> None:
+        from edge.view.digest import copy_results, run_pipeline
+
         if reader.has_results and args.rig is None and not args.calibration:
             copy_results(reader, store, stopped)
             return
