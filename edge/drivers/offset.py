@@ -22,6 +22,9 @@ REARM_LEAD_S = 5.0
 """A re-arm is due so long before the guard can close: stop and start take 0.1 s (demo) to 3 s (cascade)."""
 FIT_S = 20.0
 """Frames of this span give the line; 1 ms of jitter at 60 frames/s then leaves 5 ppm of drift."""
+LEAST_ERROR = 5e-6
+"""Of a drift: times of live frames come from a fit themselves, so that their errors last for seconds (20 ppm were seen
+on a busy computer between clocks that were equal)."""
 LEAST_FRAMES = 30
 """Fewer give no offset: half a second at 60 frames/s."""
 
@@ -175,7 +178,8 @@ class Offset:
         offset_s: second after first, modulo the period.
         drift: of the offset, seconds per second; positive: the second radar's clock is the slower one.
         drift_error: its standard error.
-        closes_in_s: time until the least guard can be used up, with three standard errors of drift; 0: it is used up.
+        closes_in_s: time until the least guard can be used up, with three standard errors of drift (5 ppm at least);
+            0: it is used up.
         overlap_s: time that both transmit at once in every period.
     """
 
@@ -252,6 +256,7 @@ class OffsetWatch:
         """Until an edge of the window is reached; before the drift is known, with the largest that the rig allows."""
         if 3 * error > self._largest_drift:
             drift, error = 0.0, self._largest_drift / 3
+        error = max(error, LEAST_ERROR)
         up, down = drift + 3 * error, -drift + 3 * error
         above, below = self.window.latest_s - offset_s, offset_s - self.window.earliest_s
         if above <= 0 or below <= 0:

@@ -14,7 +14,7 @@ import pytest
 from edge.constraints import GUARD_S
 from edge.drivers.board import Board, Progress, StartTimes
 from edge.drivers.interleave import ATTEMPTS, InterleaveStarter, MonotonicClock, OffsetWatch
-from edge.drivers.offset import PhaseLine, window_of
+from edge.drivers.offset import LEAST_ERROR, PhaseLine, window_of
 from edge.errors import ConfigError, LinkError
 from edge.frames import Float64, RadarId
 from edge.rig import Rig, load_rig
@@ -233,7 +233,7 @@ def test_the_watch_measures_offset_and_drift() -> None:
     assert found is not None
     assert found.drift == pytest.approx(30e-6, abs=1e-9)
     assert found.offset_s == pytest.approx(0.006 + 30e-6 * 1199 * period_ns / 1e9, abs=1e-8)
-    expected_s = (watch.window.latest_s - found.offset_s) / 30e-6
+    expected_s = (watch.window.latest_s - found.offset_s) / (30e-6 + 3 * LEAST_ERROR)
     assert found.closes_in_s == pytest.approx(expected_s, rel=1e-3)
     assert not watch.overlap
     assert not watch.rearm_due
