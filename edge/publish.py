@@ -71,6 +71,14 @@ class PublishingSink:
         """What could not be sent, by reason code."""
         return {"NOT_SENT": self._unsent}
 
+    def closed(self) -> str:
+        """Why part of the stream is closed; empty: it is not."""
+        return self._publisher.fault
+
+    def auth_failures(self) -> int:
+        """Handshakes of subscribers that failed since the start."""
+        return self._publisher.auth_failures
+
     def invite(self, duration_s: float) -> None:
         """Give signs of life until waiting subscribers have joined: what is published before that is lost for them."""
         end_s = time.monotonic() + duration_s

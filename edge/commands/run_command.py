@@ -40,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--segments", type=arguments.count, help="cascades: end after so many segments")
     parser.add_argument("--folder", type=Path, help="cascades: for copies of segments (default: a temporary one)")
     parser.add_argument("--keep", action="store_true", help="cascades: keep segments on the boards and their copies")
+    parser.add_argument("--metrics", type=Path, metavar="SOCKET", help="Prometheus text by HTTP on this Unix socket")
+    parser.add_argument("--metrics-port", type=arguments.count, metavar="PORT", help="the same on 127.0.0.1")
     session.add_arguments(parser, speed=None)
 
 

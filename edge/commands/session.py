@@ -27,6 +27,7 @@ from edge.rig import Rig
 from edge.service.live import LivePipeline
 from edge.service.observer import Observer
 from edge.service.serve import paced, serve
+from edge.service.supervision import Supervision
 from edge.sources.base import Loss
 from edge.stream.publisher import Publisher
 from edge.stream.wire import Source
@@ -113,12 +114,19 @@ class Session:
                 self._publishing.watch(self.pipeline)
 
     def _observe(self, pipeline: LivePipeline) -> Observer:
-        publishing = self._publishing
-        counts = None if publishing is None else publishing.counts
-        observer = Observer(pipeline, {"rfconstruct": version()}, counts=counts)
-        if publishing is not None:
+        """Look at the pipeline, and show it to subscribers, to the service manager and to whoever reads metrics."""
+        publishing, versions = self._publishing, {"rfconstruct": version()}
+        metrics, port = getattr(self._args, "metrics", None), getattr(self._args, "metrics_port", None)
+        supervision = self._stack.enter_context(Supervision.of_environment(metrics, port))
+        if publishing is None:
+            observer = Observer(pipeline, versions, supervision.progress)
+        else:
+            counts, closed = publishing.counts, publishing.closed
+            observer = Observer(pipeline, versions, supervision.progress, counts=counts, stream_closed=closed)
             publishing.watch(pipeline, observer.status)
             pipeline.beats.append(publishing.report)
+        failures = publishing.auth_failures if publishing is not None else int
+        pipeline.beats.append(lambda: supervision.show(lambda: observer.snapshot(failures())))
         return observer
 
     def _publisher(self, kind: Source) -> PublishingSink:

@@ -32,6 +32,7 @@ class Observer:
         watchdog: called while every stage that has work makes progress; None: nobody wants to know.
         poses_from: name of the pose source.
         counts: more events since the start, code -> count, each a reason while it grows.
+        stream_closed: why part of the stream is closed; empty: it is not.
     """
 
     def __init__(
@@ -41,9 +42,10 @@ class Observer:
         watchdog: Callable[[], None] | None = None,
         poses_from: str = "source",
         counts: Callable[[], Mapping[str, int]] | None = None,
+        stream_closed: Callable[[], str] = str,
     ) -> None:
         self._pipeline, self._versions, self._watchdog = pipeline, dict(versions or {}), watchdog
-        self._poses_from, self._more_counts = poses_from, counts
+        self._poses_from, self._more_counts, self._stream_closed = poses_from, counts, stream_closed
         self._machine, self._lock = StateMachine(), threading.Lock()
         self._born_ns = time.monotonic_ns()
         self._started_ns: int | None = None
@@ -159,6 +161,7 @@ class Observer:
             shed=pipeline.shedder.step,
             no_shapes=pipeline.no_shapes,
             source_error=self._source_error,
+            stream_closed=self._stream_closed(),
             stuck=tuple(stage.name for stage in pipeline.stages if stage.busy_s > STUCK_S),
             last_fault=pipeline.faults.last,
         )

@@ -36,6 +36,8 @@ class Code(StrEnum):
     SHED_DETECTIONS_ONLY = "SHED_DETECTIONS_ONLY"
     SOURCE_FAILED = "SOURCE_FAILED"
     """The source ended with an error."""
+    STREAM_CLOSED = "STREAM_CLOSED"
+    """Part of the stream had to be closed: the authenticator of subscribers from other machines died."""
     STAGE_STUCK = "STAGE_STUCK"
     """A stage does not come back from one item."""
 
@@ -61,6 +63,7 @@ class Facts:
         shed: step of load shedding.
         no_shapes: why no shapes are made; empty: they are.
         source_error: why the source ended; empty: it did not.
+        stream_closed: why part of the stream is closed; empty: it is not.
         stuck: names of stages that hang.
         last_fault: newest fault in words.
     """
@@ -73,6 +76,7 @@ class Facts:
     shed: Step = Step.NOTHING
     no_shapes: str = ""
     source_error: str = ""
+    stream_closed: str = ""
     stuck: tuple[str, ...] = ()
     last_fault: str = ""
 
@@ -127,6 +131,8 @@ class StateMachine:
         found: dict[str, str] = {}
         if facts.source_error:
             found[Code.SOURCE_FAILED] = facts.source_error
+        if facts.stream_closed:
+            found[Code.STREAM_CLOSED] = facts.stream_closed
         if facts.stuck:
             found[Code.STAGE_STUCK] = f"no progress for {STUCK_S:g} s: {', '.join(facts.stuck)}"
         silent = {radar: age_s for radar, age_s in facts.silent_s.items() if age_s > SILENT_S}
@@ -147,7 +153,7 @@ class StateMachine:
             return "STOP"
         if not facts.started:
             return "INIT"
-        if codes & {Code.SOURCE_FAILED, Code.STAGE_STUCK}:
+        if codes & {Code.SOURCE_FAILED, Code.STREAM_CLOSED, Code.STAGE_STUCK}:
             return "FAULT"
         if Code.NO_FRAMES in codes:
             return "WAIT"

@@ -52,17 +52,17 @@ class Supervision:
         """Every stage that has work makes progress, or there is none: feed systemd's watchdog."""
         self._notifier.progress()
 
-    def tick(self, snapshot: Callable[[], Snapshot]) -> bool:
-        """Once in a while, at best several times a second: takes a snapshot when one is due.
+    def show(self, snapshot: Callable[[], Snapshot]) -> None:
+        """Call it as often as convenient: once a second it takes a snapshot for the metrics and for systemd.
+
+        The first one of another state than INIT tells systemd that the service is there.
 
         Args:
             snapshot: makes it.
-        Returns:
-            Whether one was due. The first one of another state than INIT tells systemd that the service is there.
         """
         now_s = time.monotonic()
         if now_s < self._due_s:
-            return False
+            return
         self._due_s = now_s + PERIOD_S
         taken = snapshot()
         if self._metrics is not None:
@@ -73,7 +73,6 @@ class Supervision:
             self._notifier.ready(line)
         else:
             self._notifier.status(line)
-        return True
 
     def close(self) -> None:
         """Tell systemd that the service ends; the metrics are gone then."""

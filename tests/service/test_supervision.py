@@ -53,8 +53,8 @@ def test_a_life(manager: socket.socket, tmp_path: Path, now_s: list[float]) -> N
     states: tuple[State, ...] = ("INIT", "INIT", "WAIT", "RUN", "RUN")
     said = []
     for state in states:
-        assert supervision.tick(lambda state=state: snapshot(state))  # type: ignore[misc]
-        assert not supervision.tick(lambda: pytest.fail("too early"))
+        supervision.show(lambda state=state: snapshot(state))  # type: ignore[misc]
+        supervision.show(lambda: pytest.fail("too early"))
         said.append(heard(manager))
         now_s[0] += 1.5
     assert said == [["STATUS"], [], ["READY"], ["STATUS"], []]
@@ -71,7 +71,7 @@ def test_a_life(manager: socket.socket, tmp_path: Path, now_s: list[float]) -> N
 def test_without_supervisors_nothing_happens(now_s: list[float]) -> None:
     with Supervision.of_environment(environment={}) as supervision:
         supervision.progress()
-        assert supervision.tick(lambda: snapshot("RUN"))
+        supervision.show(lambda: snapshot("RUN"))
 
 
 def test_the_line_for_systemctl() -> None:
