@@ -76,6 +76,8 @@ class _Chain:
                 check = found if isinstance(found, Check) else Check(name, "ok", found)
             except RfconstructError as error:
                 check = failure(name, error)
+            except Exception as error:  # whatever the system refuses is a finding, not the end of the doctor
+                check = Check(name, "fails", f"{type(error).__name__}: {error}", "check the rights of this user")
             yield check
             if check.outcome == "fails":
                 rest = ", ".join(later for later, _ in self.steps[index + 1 :])

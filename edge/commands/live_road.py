@@ -39,6 +39,10 @@ class Limits:
     frames: int | None
     segments: int | None
 
+    def frames_of(self, most: int) -> int:
+        """Frames of a segment, at most ``most``, so that equal segments give what was asked for."""
+        return most if self.frames is None else -(-self.frames // -(-self.frames // most))
+
     def segments_of(self, frames: int) -> int | None:
         """Segments of so many frames that give what was asked for."""
         needed = None if self.frames is None else -(-self.frames // frames)
@@ -100,8 +104,7 @@ class SegmentRoad:
         self._rig, self._boards, self._live, self._poses = rig, boards, live, poses
         settings = {r: board for r, board in rig.boards.items() if isinstance(board, CascadeBoard)}
         self._fetchers = {radar: fetcher_for(board) for radar, board in settings.items()}
-        frames = min(board.segment_frames for board in settings.values())
-        frames = min(frames, limits.frames or frames)
+        frames = limits.frames_of(min(board.segment_frames for board in settings.values()))
         self._source = SegmentSource(
             rig,
             boards,

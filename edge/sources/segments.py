@@ -185,6 +185,7 @@ class SegmentSource:
                     raise
             else:
                 if self._stopped():
+                    self._remove()
                     return
                 failed_in_a_row = 0
                 yield from self._play(number, times, start)

@@ -17,6 +17,7 @@ import pytest
 from cli_run import Outcome, rfconstruct
 from virtual_boards import Virtual, virtual_boards
 
+from edge.commands.live_road import Limits
 from edge.errors import ExitCode
 from edge.rig import load_rig
 
@@ -136,6 +137,17 @@ def when_frames_run(virtual: Virtual, act: Callable[[], object]) -> None:
     while not all(part.bursts > 20 for part in parts) and time.monotonic() < end_s:
         time.sleep(0.02)
     act()
+
+
+@pytest.mark.parametrize(
+    ("frames", "most", "expected"),
+    [(3600, 360, (360, 10)), (400, 360, (200, 2)), (5, 360, (5, 1)), (None, 9, (9, None))],
+)
+def test_equal_segments(frames: int | None, most: int, expected: tuple[int, int | None]) -> None:
+    limits = Limits(frames, None)
+    each = limits.frames_of(most)
+    assert (each, limits.segments_of(each)) == expected
+    assert Limits(frames, 1).segments_of(each) == 1
 
 
 def test_boards_file_of_the_virtual_rig(tmp_path: Path) -> None:
