@@ -13,7 +13,10 @@ EDGE = sorted((ROOT / "edge").rglob("*.py"))
 STANDARD = {"__future__", "math", "typing", "collections", "dataclasses", "enum", "functools"}
 DATA = {"edge.frames", "edge.config", "edge.errors", "edge.waveform", "edge.array", "edge.rig"}
 HEAVY = {"scipy", "matplotlib", "mpl_toolkits", "tqdm", "depthai", "trimesh", "viser"}
-PROCESS_FILES = ("bench", "cli", "commands", "plot", "player", "publish", "service", "view", "warm", "view", "__main__")
+PROCESS_FILES = (
+    *("bench", "cli", "commands", "computed_results", "digest", "plot", "player", "publish", "service", "view", "warm"),
+    "__main__",
+)
 PROCESSES = ("edge.cli", "edge.commands", "edge.plot", "edge.pipeline")
 
 

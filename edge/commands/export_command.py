@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from edge.commands import arguments
 from edge.commands.session import load_model
+from edge.computed_results import computed_messages, recorded_messages
 from edge.errors import ConfigError, ExitCode, RecordingError, WireError
 from edge.pipeline import Pipeline
 from edge.recording.exporting import WHATS, ExportReport, What, export_points
@@ -20,7 +21,6 @@ from edge.recording.placing import FRAME_NAMES, Placer, require_frame
 from edge.recording.playback import Part, Playback
 from edge.recording.point_files import SUFFIXES
 from edge.recording.reader import RecordingReader
-from edge.recording.result_messages import computed_messages, recorded_messages
 from edge.rig import Rig, load_rig
 from edge.stream.messages import Message
 
@@ -30,13 +30,14 @@ MCAP = ".mcap"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("recording", type=Path, help="of results, or of raw frames: then the pipeline runs first")
-    parser.add_argument("out", type=Path, help="file (.ply, .pcd, .npz, .mcap), or a folder for a file an item")
-    parser.add_argument("--what", choices=(*WHATS, "all"), help="default: shapes; all of them for MCAP")
-    parser.add_argument("--frame", choices=FRAME_NAMES, default="odometry", help="of the points (default: %(default)s)")
+    parser.usage = "%(prog)s RECORDING OUT [options]"
+    parser.add_argument("recording", type=Path, help="of results, or of raw frames (computed first)")
+    parser.add_argument("out", type=Path, help="file (.ply, .pcd, .npz, .mcap), or folder")
+    parser.add_argument("--what", choices=(*WHATS, "all"), help="default: shapes; for MCAP all")
+    parser.add_argument("--frame", choices=FRAME_NAMES, default="odometry", help="default: odometry")
     parser.add_argument("--format", choices=FORMATS, help="of the files in a folder (default: ply)")
-    parser.add_argument("--all", action="store_true", help="every shape of an object, not the most trusted one")
-    parser.add_argument("--rig", help="name or folder, when the recording does not bring it")
+    parser.add_argument("--all", action="store_true", help="every shape of an object, not the best one")
+    parser.add_argument("--rig", metavar="NAME", help="when the recording does not bring it")
     parser.add_argument("--start", type=arguments.moment, default=0.0, metavar="S", help="begin so many seconds in")
     parser.add_argument("--end", type=arguments.moment, metavar="S", help="end so many seconds in")
 

@@ -28,17 +28,18 @@ POLL_S = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("out", type=Path, help="recording to make (.mcap); must not exist")
+    parser.usage = "%(prog)s OUT.mcap --results | --rig NAME | --from FILE [options]"
+    parser.add_argument("out", type=Path, help="recording to make; must not exist")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--results", action="store_true", help="what a running pipeline publishes")
-    what.add_argument("--rig", metavar="NAME", help="raw frames of this rig's boards (name or folder)")
-    what.add_argument("--from", dest="source", type=Path, metavar="FILE", help="of another recording, or a part of it")
-    parser.add_argument("--seconds", type=arguments.seconds, help="end after this time (default: at Ctrl-C)")
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="of the publisher (default: %(default)s)")
-    parser.add_argument("--topics", nargs="+", type=topic, metavar="TOPIC", help="results: only these (default: all)")
-    parser.add_argument("--keys", metavar="FILE", help="results: the client's secret key, for another machine")
-    parser.add_argument("--timeout", type=arguments.seconds, metavar="S", help="results: end after so long a silence")
-    parser.add_argument("--boards", type=Path, metavar="FILE", help="raw: where boards and pose sensor are reached")
+    what.add_argument("--rig", metavar="NAME", help="raw frames of its boards (name or folder)")
+    what.add_argument("--from", dest="source", type=Path, metavar="FILE", help="another recording, or a part of it")
+    parser.add_argument("--seconds", type=arguments.seconds, metavar="S", help="end after this time (default: Ctrl-C)")
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, metavar="ADDRESS", help="results: of the publisher")
+    parser.add_argument("--topics", nargs="+", type=topic, metavar="TOPIC", help="results: not all of them")
+    parser.add_argument("--keys", metavar="FILE", help="results: secret key, for another machine")
+    parser.add_argument("--timeout", type=arguments.seconds, metavar="S", help="results: end after such a silence")
+    parser.add_argument("--boards", type=Path, metavar="FILE", help="raw: where boards and poses are reached")
     parser.add_argument("--start", type=arguments.moment, default=0.0, metavar="S", help="--from: first second")
     parser.add_argument("--end", type=arguments.moment, metavar="S", help="--from: last second")
     parser.add_argument("--note", action="append", default=[], metavar="TEXT", help="kept with the data")

@@ -10,8 +10,8 @@ from pathlib import Path
 from edge.commands import arguments, session
 from edge.commands.open_source import add_rig_arguments, calibrated, open_capture, rig_of
 from edge.commands.replay_results import replay_results
+from edge.digest import ResultDigest
 from edge.errors import ConfigError, ExitCode, RecordingError
-from edge.recording.digest import ResultDigest
 from edge.recording.playback import Part, Playback
 from edge.recording.reader import RecordingReader
 from edge.rig import load_rig
@@ -20,6 +20,7 @@ from edge.sources.base import FrameSource
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.usage = "%(prog)s RECORDING [options]"
     parser.add_argument("recording", type=Path, help="MCAP recording, or a folder of one radar's capture files")
     add_rig_arguments(parser)
     session.add_arguments(parser, speed="1")
@@ -28,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--loop", type=arguments.passes, default=1, metavar="N", help="play N times, 0 = for ever; numbers go on rising"
     )
-    parser.add_argument(
-        "--live", action="store_true", help="on the live pipeline's threads, shapes while they are seen"
-    )
+    parser.add_argument("--live", action="store_true", help="as the live service: threads, early shapes")
     parser.add_argument("--digest", action="store_true", help="SHA-256 over detections, points and shapes")
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from edge.commands.interrupts import Interrupts
 from edge.config import StreamSettings
+from edge.digest import ResultDigest
 from edge.errors import ConfigError, ExitCode
-from edge.recording.digest import ResultDigest
 from edge.recording.playback import Part
 from edge.recording.reader import RecordingReader
 from edge.recording.republish import Republisher, ResultsPlayback

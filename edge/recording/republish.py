@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from edge.config import StreamSettings
+from edge.digest import ResultDigest
 from edge.errors import WireError
 from edge.player import Pace
-from edge.recording.digest import ResultDigest
 from edge.recording.playback import PASS_GAP_NS, Part
 from edge.recording.reader import RecordingReader
 from edge.recording.stored_results import StoredResult, parse, shifted

@@ -14,9 +14,9 @@ from pipeline_scenes import PERIOD_NS, RIG, Item, frames_of, in_time_order, scen
 
 from edge.completion.manifest import find_model
 from edge.completion.model import CompletionModel
+from edge.digest import ResultDigest
 from edge.frames import Float32, ObjectCloud, Pose
 from edge.pipeline import FrameResult, Pipeline, WindowResult
-from edge.recording.digest import ResultDigest
 from edge.recording.playback import PASS_GAP_NS, Part, Playback
 from edge.recording.reader import RecordingReader
 from edge.recording.writer import RecordingWriter

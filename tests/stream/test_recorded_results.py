@@ -16,8 +16,8 @@ from stream_samples import BOOT, STAMP, detections, fused_cloud, heatmap, point_
 from stream_sockets import LOCAL, WAIT_S, Raw, publisher
 
 from edge.cli import main
+from edge.digest import ResultDigest
 from edge.errors import ExitCode, RecordingError, WireError
-from edge.recording.digest import ResultDigest
 from edge.recording.playback import Part
 from edge.recording.reader import RecordingReader
 from edge.recording.recorder import Recorder
