@@ -68,18 +68,19 @@ class PairGate:
     Args:
         rig: radars, schedules, longest pose gap.
         faults: counts refused poses; its ``last`` is kept up to date.
+        ahead_s: poses are continued this far after the newest one instead of waiting for the next; 0: not at all.
     Attributes:
         ledgers: radar id -> account of its frames.
         epoch: odometry frames that ended so far.
     """
 
-    def __init__(self, rig: Rig, faults: Faults) -> None:
+    def __init__(self, rig: Rig, faults: Faults, ahead_s: float = 0.0) -> None:
         self._rig, self._faults = rig, faults
         self.radars: tuple[RadarId, ...] = tuple(radar for radar in RADARS if radar in rig.radars)
         self._pairer = FramePairer(self.radars)
         self.ledgers: dict[RadarId, FrameLedger] = self._pairer.ledgers
         self.epoch = 0
-        self._track = PoseTrack(rig.settings.fusion.max_pose_gap_s)
+        self._track = PoseTrack(rig.settings.fusion.max_pose_gap_s, ahead_s=ahead_s)
         self._waiting: deque[FramePair] = deque()
         self._newest_pose_ns: int | None = None
         self._refused_in_a_row = 0

@@ -10,7 +10,7 @@ import numpy as np
 from edge.config import require
 from edge.errors import PoseError
 from edge.frames import Float64, Pose
-from edge.odometry.transforms import interpolate, rotation_matrix
+from edge.odometry.transforms import extrapolate, interpolate, rotation_matrix
 
 NS_PER_S = 1_000_000_000
 VELOCITY_SPAN_S = 0.05
@@ -26,14 +26,18 @@ class PoseTrack:
         max_gap_s: poses further apart are not interpolated between.
         keep_s: poses older than the newest by more than this are forgotten.
         capacity: most poses held; the oldest go first.
+        ahead_s: up to this much after the newest pose it is continued at the velocity and the turn rate of the last
+            ``VELOCITY_SPAN_S``; 0: not at all.
     Raises:
         ConfigError: a value that cannot work.
     """
 
-    def __init__(self, max_gap_s: float, keep_s: float = 30.0, capacity: int = 16384) -> None:
+    def __init__(self, max_gap_s: float, keep_s: float = 30.0, capacity: int = 16384, ahead_s: float = 0.0) -> None:
         require(0 < max_gap_s < np.inf, "max_gap_s", max_gap_s, "> 0, finite")
         require(max_gap_s <= keep_s < np.inf, "keep_s", keep_s, f">= max_gap_s ({max_gap_s}), finite")
         require(capacity >= 2, "capacity", capacity, ">= 2")
+        require(0 <= ahead_s <= max_gap_s, "ahead_s", ahead_s, f"0..max_gap_s ({max_gap_s})")
+        self._ahead_ns = round(ahead_s * NS_PER_S)
         self._max_gap_ns = round(max_gap_s * NS_PER_S)
         self._keep_ns = round(keep_s * NS_PER_S)
         self._capacity = capacity
@@ -70,6 +74,9 @@ class PoseTrack:
 
     def at(self, t_ns: int) -> Pose | None:
         """Pose at an instant: linear in position, slerp in rotation, exact at a sample; None where it is unknown."""
+        ends = self._ahead(int(t_ns))
+        if ends is not None:
+            return extrapolate(*ends, int(t_ns))
         bracket = self._bracket(int(t_ns))
         if isinstance(bracket, str):
             return None
@@ -86,20 +93,37 @@ class PoseTrack:
             float64 [3], m/s; None where the pose is unknown or stands alone between gaps.
         """
         t_ns = int(t_ns)
-        pose, bracket = self.at(t_ns), self._bracket(t_ns)
-        if pose is None or isinstance(bracket, str):
+        pose, ends = self.at(t_ns), self._ahead(t_ns) or self._around(t_ns)
+        if pose is None or ends is None:
+            return None
+        a, b = ends
+        velocity_odom_m_s = (b.position_m - a.position_m) * (NS_PER_S / (b.t_ns - a.t_ns))
+        return rotation_matrix(pose.quaternion_xyzw).T @ velocity_odom_m_s
+
+    def _around(self, t_ns: int) -> tuple[Pose, Pose] | None:
+        """Poses at the ends of the span around an instant, or of the part of it that has poses; None: none."""
+        bracket = self._bracket(t_ns)
+        if isinstance(bracket, str):
             return None
         half_ns = round(VELOCITY_SPAN_S * NS_PER_S / 2)
         start = self._reach(bracket[0], -1, t_ns - half_ns)
         end = self._reach(bracket[1], +1, t_ns + half_ns)
         if start == end:
             return None
-        start_ns, end_ns = max(t_ns - half_ns, self._times[start]), min(t_ns + half_ns, self._times[end])
-        a, b = self.at(start_ns), self.at(end_ns)
-        if a is None or b is None:
+        a = self.at(max(t_ns - half_ns, self._times[start]))
+        b = self.at(min(t_ns + half_ns, self._times[end]))
+        return None if a is None or b is None else (a, b)
+
+    def _ahead(self, t_ns: int) -> tuple[Pose, Pose] | None:
+        """The newest pose and the one ``VELOCITY_SPAN_S`` before it, to be continued to an instant after both.
+
+        None when the instant is not after the newest pose or too far after it, and when that pose stands alone.
+        """
+        newest = len(self._times) - 1
+        if newest < 1 or not 0 < t_ns - self._times[newest] <= self._ahead_ns:
             return None
-        velocity_odom_m_s = (b.position_m - a.position_m) * (NS_PER_S / (end_ns - start_ns))
-        return rotation_matrix(pose.quaternion_xyzw).T @ velocity_odom_m_s
+        before = self._reach(newest, -1, self._times[newest] - round(VELOCITY_SPAN_S * NS_PER_S))
+        return (self._poses[before], self._poses[newest]) if before < newest else None
 
     def why_none(self, t_ns: int) -> str:
         """Reason why ``at(t_ns)`` is None, for a message or a log; empty when it is a pose."""

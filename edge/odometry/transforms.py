@@ -105,7 +105,7 @@ def slerp(q0_xyzw: Float64, q1_xyzw: Float64, share: float) -> Float64:
 
     Args:
         q0_xyzw, q1_xyzw: float64 [4], of either sign.
-        share: 0 gives q0, 1 gives q1 (as rotations).
+        share: 0 gives q0, 1 gives q1 (as rotations); more than 1 turns on at the same rate.
     Returns:
         float64 [4], unit, on q0's side of the sphere.
     Source:
@@ -141,6 +141,24 @@ def interpolate(a: Pose, b: Pose, t_ns: int) -> Pose:
     if t_ns == b.t_ns:
         return b
     share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)  # integer differences: exact for absolute times beyond 2^53
+    position_m = a.position_m + share * (b.position_m - a.position_m)
+    return Pose(t_ns, position_m, slerp(a.quaternion_xyzw, b.quaternion_xyzw, share))
+
+
+def extrapolate(a: Pose, b: Pose, t_ns: int) -> Pose:
+    """Pose at ``t_ns`` after two poses, at the velocity and the turn rate between them.
+
+    Args:
+        a, b: poses with a.t_ns < b.t_ns.
+        t_ns: instant, b.t_ns <= t_ns.
+    Raises:
+        PoseError: the instant lies before b, or the poses are of one instant or in the wrong order.
+    """
+    if not a.t_ns < b.t_ns <= t_ns:
+        raise PoseError(
+            "cannot extrapolate from these poses", value=t_ns, allowed=f"an instant >= {b.t_ns} ns, first pose earlier"
+        )
+    share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
     position_m = a.position_m + share * (b.position_m - a.position_m)
     return Pose(t_ns, position_m, slerp(a.quaternion_xyzw, b.quaternion_xyzw, share))
 
