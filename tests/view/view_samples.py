@@ -132,9 +132,9 @@ def drive(length_s: float) -> list[Draft]:
         if number % 2 == 0:
             drafts += [heatmap_draft("horizontal", t_s, number), heatmap_draft("vertical", t_s, number)]
         if number % 10 == 9:
-            drafts += [cloud_draft(t_s), status_draft(t_s), shape_draft(1, t_s, (4.0, 4.0))]
-            drafts.append(convert.encode_shape(thing(2, t_s, (9.5, 3.2), "bicycle", brick((1.8, 0.5, 1.6), 0.4))))
-            drafts.append(convert.encode_shape(thing(3, t_s, (0.0, 3.6), "pedestrian", brick((0.5, 0.5, 1.7)))))
+            drafts += [cloud_draft(t_s), status_draft(t_s), shape_draft(1, t_s, (10.5, 4.6))]
+            drafts.append(convert.encode_shape(thing(2, t_s, (7.5, 3.4), "bicycle", brick((1.8, 0.5, 1.6), 0.4))))
+            drafts.append(convert.encode_shape(thing(3, t_s, (12.0, 3.0), "pedestrian", brick((0.5, 0.5, 1.7)))))
     return drafts
 
 
