@@ -25,7 +25,7 @@ $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "RFconstruct needs Python 3.11 or newer, this is " + sys.version.split()[0])'
 	$(PYTHON) -m venv $(VENV)
 
-EDGE := requirements/edge.txt requirements/plot.txt requirements/import.txt requirements/build.txt
+EDGE := requirements/edge.txt requirements/plot.txt requirements/import.txt requirements/view.txt requirements/build.txt
 $(VENV)/.edge: $(BIN)/python pyproject.toml $(EDGE)
 	$(PIP) $(EDGE:%=-r %)
 	$(PIP) --no-deps --no-build-isolation --editable .
