@@ -155,12 +155,13 @@ class SegmentRoad:
         reports = self._source.reports
         starts = [report.start for report in reports if report.start is not None]
         offsets = [f"{1e3 * start.offset_s:.2f} +- {500 * start.spread_s:.2f}" for start in starts]
-        drift_ms = 1e3 * self._rig.interleave.drift_s_per_s * self._segment_s
+        ppm = 1e6 * self._rig.interleave.drift_s_per_s
+        drift_ms = 1e-3 * ppm * self._segment_s
         return {
             "segments": len(reports),
             "start offsets in ms": ", ".join(offsets) or "one radar",
             "start attempts": sum(start.attempts for start in starts),
-            "drift within a segment": f"at most {drift_ms:.2f} ms at {1e6 * self._rig.interleave.drift_s_per_s:g} ppm",
+            "drift within a segment": f"at most {drift_ms:.2f} ms at {ppm:g} ppm" if starts else "one radar",
             "fetched in seconds": ", ".join(f"{report.fetched_s:.1f}" for report in reports),
             **_pose_figures(self._poses),
         }
