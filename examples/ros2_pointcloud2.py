@@ -91,12 +91,12 @@ def pointcloud2(message: ShapeMessage | CloudMessage, frame_id: str = "odom") ->
 
     Coordinates are float32: more than some kilometres from the origin of the odometry they lose millimetres.
     """
-    shape = isinstance(message, ShapeMessage)
-    pose, xyz_m = (message.pose, message.fine_m) if shape else (message.cloud.reference, message.cloud.xyz_m)
-    placed_m = transform_points(pose, xyz_m).astype(np.float32)
-    columns: dict[str, NDArray[Any]] = {axis: placed_m[:, k] for k, axis in enumerate("xyz")}
-    if not shape:
-        columns["intensity"] = message.cloud.power_db
+    if isinstance(message, ShapeMessage):
+        placed_m, more = transform_points(message.pose, message.fine_m), {}
+    else:
+        cloud = message.cloud
+        placed_m, more = transform_points(cloud.reference, cloud.xyz_m), {"intensity": cloud.power_db}
+    columns = {axis: placed_m[:, k].astype(np.float32) for k, axis in enumerate("xyz")} | more
     return layout(RosHeader(stamp(message.header), frame_id), columns)
 
 
