@@ -7,6 +7,7 @@ import os
 import resource
 import tempfile
 import time
+from array import array
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -34,6 +35,8 @@ DEADLINE_CAUSES = (LossCause.OVERFLOW, LossCause.SHED, LossCause.FAILED)
 SETTLED_SHARE = 0.2
 """Memory and processor time are counted after this share of the run."""
 SAMPLE_S = 1.0
+GROWTH_S = 600.0
+"""Shorter runs say nothing about growth: memory pools still fill."""
 KEPT_STAGES = ("to_points", "to_shape")
 LIMITS = {
     "unaccounted frames": 0.0,
@@ -53,7 +56,7 @@ class _RunTimes(SharedTimes):
 
     def __init__(self) -> None:
         super().__init__()
-        self.kept: dict[str, list[float]] = {stage: [] for stage in KEPT_STAGES}
+        self.kept = {stage: array("f") for stage in KEPT_STAGES}
 
     def record(self, stage: str, duration_us: float) -> None:
         """Add one measurement in microseconds."""
@@ -115,7 +118,8 @@ def soak(
         no_shapes: why.
         stopped: ends the run before its time.
     Returns:
-        "figures": name -> number; "accounts"; "stages"; "threads": name -> share of a core; "reasons"; "load".
+        "figures": name -> number; "accounts"; "stages"; "threads": name -> share of a core; "reasons"; "rss_mb" once a
+        second; "load" of the machine.
     """
     start_s = time.monotonic()
     with ExitStack() as stack:
@@ -162,6 +166,7 @@ def soak(
         "stages": {stage: [t.count, t.p50_us, t.p99_us, t.max_us] for stage, t in times.summary().items()},
         "threads": {stage.name: stage.cpu_s / ran_s for stage in road.stages},
         "reasons": sorted({reason.code for reason in observer.verdict.reasons}),
+        "rss_mb": [round(rss_mb, 2) for rss_mb in samples.rss_mb],
         "load": list(os.getloadavg()),
     }
 
@@ -172,7 +177,7 @@ def missed(result: dict[str, Any]) -> list[str]:
     return [
         f"{name}: {figures[name]:.4g}, at most {limit:g}"
         for name, limit in LIMITS.items()
-        if name in figures and figures[name] > limit
+        if figures.get(name, 0.0) > limit and not (name.startswith("RSS growth") and figures["seconds"] < GROWTH_S)
     ]
 
 
