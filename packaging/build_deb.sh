@@ -54,18 +54,21 @@ if [ "$venv" = yes ]; then
     "$python" -m venv --without-pip "$home"
     pip --python "$home/bin/python" install --no-compile --requirement "$top/requirements/edge.txt"
     pip --python "$home/bin/python" install --no-compile --no-deps "$work"/wheel/*.whl
+    find "$home/lib" -type d -name tests -prune -exec rm -rf {} +
     # What was built in $root will lie in /: its interpreter is the system's, its paths begin at the root.
     for link in python python3; do ln -sfn "/usr/bin/python3.$python_minor" "$home/bin/$link"; done
     rm -f "$home/bin/python3.$python_minor" "$home/bin/"[Aa]ctivate*
     sed -i "1s|^#!.*python.*|#!/opt/rfconstruct/bin/python|" "$home/bin/rfconstruct"
     find "$home/bin" -type f ! -name rfconstruct -delete
+    rm -f "$home"/lib/python3.*/site-packages/rfconstruct-*.dist-info/direct_url.json
     printf 'home = /usr/bin\ninclude-system-site-packages = false\nversion = 3.%s\n' "$python_minor" >"$home/pyvenv.cfg"
     "$python" -m compileall -q -s "$root" -p / "$home" >/dev/null || fail "a module does not compile"
 else
     printf '#!/bin/sh\necho "rfconstruct: this package was built with --no-venv" >&2\nexit 1\n' >"$home/bin/rfconstruct"
     chmod 0755 "$home/bin/rfconstruct"
 fi
-if grep -rIl -- "$work" "$root" | grep -q .; then fail "the package holds paths of this machine"; fi
+strays=$(grep -rIl -- "$work" "$root" || true)
+[ -z "$strays" ] || fail "files that hold paths of this machine: $strays"
 
 for script in postinst prerm postrm; do install -m 0755 "$top/packaging/debian/$script" "$root/DEBIAN/$script"; done
 echo /etc/rfconstruct/environment >"$root/DEBIAN/conffiles"
@@ -85,4 +88,4 @@ Description: 3-D shapes of road users from two orthogonal 77 GHz radars
  and publishes their shapes over ZeroMQ. Runs as a hardened service.
 CONTROL
 mkdir -p "$out"
-dpkg-deb --root-owner-group -Zxz -z3 --build "$root" "$out/rfconstruct_${version}_$architecture.deb"
+dpkg-deb --root-owner-group -Zzstd -z6 --build "$root" "$out/rfconstruct_${version}_$architecture.deb"

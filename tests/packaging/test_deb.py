@@ -29,7 +29,8 @@ FILES = {
     "etc/rfconstruct/environment": 0o644,
 }
 SCRIPTS = ("postinst", "prerm", "postrm")
-EDGE_LIMIT_MB = 330
+EDGE_LIMIT_MB = 400
+"""With its compiled modules, 48 MB of it."""
 
 
 def build(folder: Path, *options: str, timeout_s: float = 60.0) -> tuple[Path, Path]:
@@ -141,4 +142,4 @@ def test_the_whole_package_runs_without_torch_and_keeps_its_size(tmp_path: Path)
     assert "usage: rfconstruct COMMAND" in answer.stdout
     assert str(ROOT) not in (home / "pyvenv.cfg").read_text()
     size = int(re.search(r"Installed-Size: (\d+)", (control / "control").read_text())[1])  # type: ignore[index]
-    assert size / 1024 < EDGE_LIMIT_MB * 1.2
+    assert size / 1024 < EDGE_LIMIT_MB
