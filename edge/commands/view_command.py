@@ -131,7 +131,8 @@ def watch_live(page: Page, client: Client, stopped: Callable[[], bool], scene: S
             "malformed": str(client.malformed),
             "stream": client.endpoint,
         }
-        page.update(scene, scene.health.banner(now_s, client.endpoint, STALE_S), figures, now_s)
+        shown_s = now_s if scene.health.stopped_s is None else scene.health.stopped_s
+        page.update(scene, scene.health.banner(now_s, client.endpoint, STALE_S), figures, shown_s)
 
 
 def watch_recording(

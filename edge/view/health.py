@@ -52,11 +52,20 @@ class Sample:
 
 @dataclass(slots=True)
 class Health:
-    """What is known about the publisher."""
+    """What is known about the publisher.
+
+    Args:
+        status: the newest.
+        state: of the newest status or heartbeat.
+        heard_s: when the last message came.
+        stopped_s: when the publisher said that it ends; None: it has not. Time stands still from then on.
+        history: for the strips.
+    """
 
     status: Status | None = None
     state: State | None = None
     heard_s: float | None = None
+    stopped_s: float | None = None
     history: deque[Sample] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
     def hear(self, wall_s: float) -> None:
@@ -65,11 +74,11 @@ class Health:
 
     def add(self, message: StatusMessage | HeartbeatMessage, wall_s: float) -> None:
         """Take a status or a heartbeat."""
+        self.state = message.state if isinstance(message, HeartbeatMessage) else message.status.state
+        self.stopped_s = (self.stopped_s or wall_s) if self.state == "STOP" else None
         if isinstance(message, HeartbeatMessage):
-            self.state = message.state
             return
-        status = message.status
-        self.status, self.state = status, status.state
+        self.status = status = message.status
         lost = sum(sum(radar.lost.values()) for radar in status.radars.values())
         latency_ms = {stage: values[1] / 1e3 for stage, values in status.latency_us.items()}
         self.history.append(Sample(wall_s, latency_ms, lost, {name: r.fps for name, r in status.radars.items()}))

@@ -59,9 +59,7 @@ class Stage:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
         self._scene.set_up_direction("+z")
-        self._scene.configure_default_lights(
-            True, cast_shadow=False
-        )
+        self._scene.configure_default_lights(True, cast_shadow=False)
         self._scene.configure_environment_map(None)  # it and shadows cost a computer without GPU more than they show
         self._scene.add_light_ambient("/light", intensity=1.5)
         self._root = self._scene.add_frame("/world", show_axes=False)
@@ -191,14 +189,16 @@ class Stage:
         if look.show_boxes:
             kept |= {f"{name}/box", f"{name}/label"}
             if self._changed(f"{name}/box", key):
-                lines = self._scene.add_line_segments(
-                    f"{name}/box", thing.box.edges(), faded(plain, strength), thickness=0.025
-                )
+                edges = np.concatenate([thing.box.edges(), _pole(thing)[None]])
+                lines = self._scene.add_line_segments(f"{name}/box", edges, faded(plain, strength), thickness=0.025)
                 self._nodes[f"{name}/box"] = (key, lines)
             if self._changed(f"{name}/label", key):
-                top = thing.box.center_m + np.array([0.0, 0.0, thing.box.size_m[2] / 2 + 0.15])
                 label = self._scene.add_label(
-                    f"{name}/label", object_label(thing), position=tuple(top), anchor="bottom-center"
+                    f"{name}/label",
+                    object_label(thing),
+                    position=tuple(_pole(thing)[1]),
+                    anchor="bottom-center",
+                    font_screen_scale=0.9,
                 )
                 self._nodes[f"{name}/label"] = (key, label)
 
@@ -228,3 +228,9 @@ class Stage:
     def _clear(self, kept: set[str]) -> None:
         for name in [name for name in self._nodes if name not in kept]:
             self._nodes.pop(name)[1].remove()
+
+
+def _pole(thing: Thing) -> Float64:
+    """From the middle of the box's top to its label, [2, 3]; neighbours' labels are at different heights."""
+    top_m = thing.box.center_m + np.array([0.0, 0.0, thing.box.size_m[2] / 2])
+    return np.stack([top_m, top_m + np.array([0.0, 0.0, 0.2 + 0.35 * (thing.identity % 3)])])

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from browser import browser
+from PIL import Image
 
 COMMAND = (sys.executable, "-m", "edge")
 
@@ -45,16 +46,18 @@ def main() -> int:
         url = json.loads(viewer.stdout.readline())["url"]
         tab.call("Page.navigate", url=url)
         if not recording:
-            demo = subprocess.Popen([*COMMAND, "demo", "--speed", "0.5"], stdout=subprocess.DEVNULL)
-        found = tab.wait_for("document.body.innerText.includes('car')", 60.0)
-        print(f"{url}: {'an object' if found else 'no object'} after the wait")
+            demo = subprocess.Popen([*COMMAND, "demo", "--speed", "0.2"], stdout=subprocess.DEVNULL)
+        sign = "recording read: 100" if recording else "horizontal"  # the account of the first status
+        print(f"{url}: {tab.wait_for(f'document.body.innerText.includes({sign!r})', 90.0)}")
         tab.evaluate("document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
         for number in range(1, 4):
-            time.sleep(4.0)
-            print(tab.picture(out / f"viewer_{number}.png"), tab.errors)
-        print(sorted(set(tab.requested)))
+            time.sleep(3.0)
+            path = tab.picture(out / f"viewer_{number}.png")
+            with Image.open(path) as picture:
+                picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+            print(f"{path}: {path.stat().st_size} bytes")
         if not recording:
-            demo.wait(60)
+            demo.wait(120)
     return 0
 
 

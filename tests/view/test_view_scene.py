@@ -186,6 +186,15 @@ def test_the_banner_tells_waiting_running_and_stale_apart() -> None:
     assert states == ["WAITING", "RUN", "STALE", "RUN", "STOP"]
 
 
+def test_time_stands_still_after_the_publisher_said_stop() -> None:
+    scene = Scene()
+    for t_s, state in ((1.0, "RUN"), (2.0, "STOP"), (3.0, "STOP")):
+        scene.add(message(status_draft(t_s, state)), 10.0 + t_s)  # type: ignore[arg-type]
+    assert scene.health.stopped_s == 12.0
+    scene.add(message(status_draft(4.0)), 14.0)
+    assert scene.health.stopped_s is None
+
+
 def test_losses_turn_the_banner_to_a_warning_with_reasons() -> None:
     scene = Scene()
     scene.add(message(status_draft(1.0, "DEGRADED", lost=3, detail="gap of 0.3 s")), 10.0)
