@@ -98,17 +98,18 @@ class PairQueue:
 
 
 class ShapeQueue:
-    """Objects that wait for their completion: of each object only the newest, and its final one.
+    """Objects that wait for their completion: of each object only the newest, and every final one.
 
     Args:
-        capacity: objects that may wait; beyond, the oldest goes that is no final one, else the oldest.
+        capacity: asks that may wait; beyond, the oldest goes that is no final one, else the oldest.
         clock_ns: monotonic.
     """
 
     def __init__(self, capacity: int, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.capacity = capacity
         self._clock_ns = clock_ns
-        self._waiting: dict[int, tuple[ObjectCloud, int]] = {}
+        self._waiting: dict[tuple[int, int | None], tuple[ObjectCloud, int]] = {}
+        """(Identity, end of the window of a final one) -> object and instant of the ask, in the order of the line."""
         self._changed = threading.Condition()
 
     def __len__(self) -> int:
@@ -118,16 +119,18 @@ class ShapeQueue:
         """Ask for a shape; returns what will not be completed: an older ask of the object, or one without room.
 
         The newer ask keeps the older one's place in the line.
+        A final one makes a waiting ask needless and goes to the end of the line.
         """
+        key = (cloud.identity, cloud.t_end_ns if cloud.final else None)
         with self._changed:
-            before = self._waiting.get(cloud.identity)
-            if before is not None and before[0].final and not cloud.final:
-                return cloud
+            before = self._waiting.get((cloud.identity, None))
             dropped = None if before is None else before[0]
-            if before is None and len(self._waiting) >= self.capacity:
-                victim = next((i for i, (waiting, _) in self._waiting.items() if not waiting.final), None)
-                dropped = self._waiting.pop(next(iter(self._waiting)) if victim is None else victim)[0]
-            self._waiting[cloud.identity] = (cloud, self._clock_ns())
+            if before is not None and cloud.final:
+                del self._waiting[cloud.identity, None]
+            elif before is None and len(self._waiting) >= self.capacity:
+                victim = next((other for other, (waiting, _) in self._waiting.items() if not waiting.final), None)
+                dropped = self._waiting.pop(victim or next(iter(self._waiting)))[0]
+            self._waiting[key] = (cloud, self._clock_ns())
             self._changed.notify()
             return dropped
 

@@ -76,16 +76,19 @@ def test_a_pair_that_nobody_has_begun_goes_first() -> None:
     assert line.take("vertical", 0.0) is jobs[2]
 
 
-def test_of_an_object_only_the_newest_waits_and_its_final_one_stays() -> None:
-    line = ShapeQueue(2, clock_ns=lambda: 7)
-    first, newer, other, final, late = thing(1), thing(1, 2), thing(2), thing(1, 3, final=True), thing(1, 4)
+def test_of_an_object_only_the_newest_waits_and_every_final_one() -> None:
+    line = ShapeQueue(3, clock_ns=lambda: 7)
+    first, newer, other, final, again = thing(1), thing(1, 2), thing(2), thing(1, 3, final=True), thing(1, 4)
     assert line.put(first) is None
     assert line.put(other) is None
     assert line.put(newer) is first
     assert line.put(final) is newer
-    assert line.put(late) is late, "after the final one nothing comes"
+    assert line.put(again) is None, "it was found again: a new ask, and the final one stays"
     assert line.put(thing(3)) is other, "without room the oldest goes that is no final one"
-    assert line.take(0.0) == (final, 7)
+    assert [line.take(0.0) for _ in range(2)] == [(final, 7), (again, 7)]
+    full = ShapeQueue(1)
+    full.put(final)
+    assert full.put(first) is final, "only final ones: the oldest goes"
 
 
 def test_windows_and_shapes_leave_before_frames_and_drops_are_counted() -> None:
