@@ -6,7 +6,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from edge.commands.interrupts import Interrupts
 from edge.commands.listen_command import topic
 from edge.commands.record_live import LiveRecording
 from edge.commands.record_progress import Progress
-from edge.errors import ConfigError, ExitCode
+from edge.errors import ConfigError, ExitCode, RecordingError
 from edge.recording.copying import copy_part
 from edge.recording.playback import Part
 from edge.recording.recorder import Recorder
@@ -28,7 +29,7 @@ POLL_S = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.usage = "%(prog)s OUT.mcap --results | --rig NAME | --from FILE [options]"
+    parser.usage = "%(prog)s OUT --results | --rig NAME | --from FILE [options]"
     parser.add_argument("out", type=Path, help="recording to make; must not exist")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--results", action="store_true", help="what a running pipeline publishes")
@@ -66,12 +67,9 @@ def _results(args: argparse.Namespace, interrupts: Interrupts) -> int:
         recorder = Recorder(RecordingWriter(args.out, None, notes))
         client.record_to(recorder)
         _say(args, f"recording results of {args.endpoint} to {args.out}; Ctrl-C ends it")
-        try:
-            with Progress(args.json, recorder) as progress:
-                _listen(client, args, lambda: interrupts.asked() or recorder.failure is not None, progress)
-        finally:
-            account = _account(recorder)
-            recorder.close()
+        with _closing(args, recorder), Progress(args.json, recorder) as progress:
+            _listen(client, args, lambda: interrupts.asked() or recorder.failure is not None, progress)
+        account = _account(recorder)
         account |= {"lost": client.lost, "malformed": client.malformed, "publisher restarts": client.restarts}
     return _report(args, account, bool(client.lost or client.malformed))
 
@@ -97,12 +95,9 @@ def _live(args: argparse.Namespace, interrupts: Interrupts) -> int:
     live = LiveRecording(args, interrupts.asked)
     recorder = Recorder(RecordingWriter(args.out, live.rig, args.note))
     _say(args, f"recording rig {live.rig.name} to {args.out}; Ctrl-C ends it")
-    try:
-        with Progress(args.json, recorder) as progress:
-            live.run(recorder, progress)
-    finally:
-        account = _account(recorder)
-        recorder.close()
+    with _closing(args, recorder), Progress(args.json, recorder) as progress:
+        live.run(recorder, progress)
+    account = _account(recorder)
     account |= {"lost": {radar: dict(causes) for radar, causes in live.lost.items()}, "notes": live.notes}
     return _report(args, account, bool(live.faults or any(live.lost.values())))
 
@@ -115,22 +110,39 @@ def _copy(args: argparse.Namespace) -> int:
     return _report(args, account | {"notes": report.notes}, report.damaged)
 
 
+@contextmanager
+def _closing(args: argparse.Namespace, recorder: Recorder) -> Iterator[None]:
+    """Close it whatever happens; a recording without any message is no recording, and its name stays free."""
+    try:
+        yield
+    finally:
+        try:
+            recorder.close()
+        except RecordingError:
+            _say(args, f"written before: {_counts(recorder.written)}; dropped since: {_counts(recorder.dropped)}")
+            raise
+        finally:
+            if not recorder.written:
+                recorder.path.unlink(missing_ok=True)
+
+
 def _account(recorder: Recorder) -> dict[str, Any]:
-    """What is known before the file is closed; small messages may still wait for their chunk."""
-    while recorder.waiting_bytes and recorder.failure is None:
-        time.sleep(0.01)
     account: dict[str, Any] = {"recording": str(recorder.path), "bytes": recorder.bytes_written}
     return account | {"written": dict(recorder.written), "dropped": dict(recorder.dropped)}
+
+
+def _counts(counts: Mapping[str, object]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "nothing"
 
 
 def _report(args: argparse.Namespace, account: dict[str, Any], degraded: bool) -> int:
     if args.json:
         print(json.dumps(account, indent=2))
     else:
-        print(f"{args.out}: {args.out.stat().st_size / 1e6:.1f} MB")
+        size = f"{args.out.stat().st_size / 1e6:.1f} MB" if args.out.exists() else "nothing came, no file was made"
+        print(f"{args.out}: {size}")
         for key in ("written", "dropped", "lost"):
-            parts = ", ".join(f"{name} {count}" for name, count in account.get(key, {}).items())
-            print(f"{key}: {parts or 'nothing'}")
+            print(f"{key}: {_counts(account.get(key, {}))}")
         for note in account.get("notes", []):
             print(f"note: {note}")
     return ExitCode.DEGRADED if degraded or account.get("dropped") or not account["written"] else ExitCode.OK

@@ -19,6 +19,8 @@ from edge.recording.reader import RecordingReader
 from edge.recording.republish import Republisher, ResultsPlayback
 from edge.version import version
 
+QUEUE = 1000
+"""Messages that may wait for a subscriber: without a pace they leave in one burst."""
 JOIN_S = 1.2
 """Subscribers that wait for the address look for it every second at most."""
 
@@ -36,7 +38,7 @@ def replay_results(reader: RecordingReader, part: Part, args: argparse.Namespace
     with ExitStack() as stack:
         publisher: Republisher | None = None
         if not args.no_publish:
-            settings = StreamSettings()
+            settings = StreamSettings(send_high_water_mark=QUEUE)
             if args.endpoint:
                 settings = replace(settings, endpoints=tuple(args.endpoint))
             publisher = Republisher(settings)

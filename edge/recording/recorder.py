@@ -155,6 +155,8 @@ class Recorder:
                     write()
             except RecordingError as error:
                 self.failure = error
+            except Exception as error:  # whatever it was: the live path must not notice
+                self.failure = RecordingError(f"{self.path}: recording stopped", value=repr(error))
             with self._changed:
                 self._waiting_bytes -= size
                 if samples is not None:

@@ -18,7 +18,7 @@ from edge.commands import info_command
 from edge.errors import ExitCode
 from edge.rig import known_rigs
 
-RADAR_VERBS = ("demo", "replay", "listen", "import", "info", "bench")
+RADAR_VERBS = ("demo", "replay", "record", "recover", "export", "listen", "import", "info", "bench")
 USAGE = [
     ("replay",),
     ("replay", "x.mcap", "--speed", "fast"),
