@@ -130,14 +130,16 @@ class Listener:
 
     def __init__(self, endpoint: str) -> None:
         self.messages: list[Message] = []
-        self.client = connect(endpoint, timeout_s=0.2)
+        self.client = connect(endpoint)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._work)
         self._thread.start()
 
     def _work(self) -> None:
         while not self._done.is_set():
-            self.messages += list(self.client)
+            message = self.client.recv(0.2)
+            if message is not None:
+                self.messages.append(message)
 
     def stop(self) -> None:
         self._done.set()
