@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 from browser import browser
 from PIL import Image
 
@@ -53,8 +54,9 @@ def main() -> int:
         for number in range(1, 4):
             time.sleep(3.0)
             path = tab.picture(out / f"viewer_{number}.png")
-            with Image.open(path) as picture:
-                picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+            with Image.open(path) as picture:  # steps of four: nobody sees them, and the file is a third smaller
+                levels = np.asarray(picture.convert("RGB"), np.int16)
+            Image.fromarray(np.clip((levels + 2) // 4 * 4, 0, 255).astype(np.uint8)).save(path, optimize=True)
             print(f"{path}: {path.stat().st_size} bytes")
         if not recording:
             demo.wait(120)
