@@ -280,7 +280,7 @@ def _vertex(path: Path, declarations: list[list[str]]) -> tuple[int, list[str], 
         raise RecordingError(f"{path}: first element is no vertex", value=" ".join(first))
     names, formats = [], []
     for words in declarations[1:]:
-        if words[0] == "element":
+        if words[:1] == ["element"]:
             break
         if len(words) != 3 or words[0] != "property" or words[1] not in _PLY_TYPES or words[2] in names:
             raise RecordingError(f"{path}: property cannot be read", value=" ".join(words), allowed="scalar properties")

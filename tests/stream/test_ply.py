@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from stream_samples import STAMP, shape
 
@@ -92,6 +92,7 @@ HEAD = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float 
 
 
 @settings(max_examples=300, deadline=None)
+@example(place=69, insert=b"\n\t", drop=0)
 @given(place=st.integers(0, len(HEAD)), insert=st.binary(max_size=6), drop=st.integers(0, 3))
 def test_mutated_files(tmp_path_factory: pytest.TempPathFactory, place: int, insert: bytes, drop: int) -> None:
     path = tmp_path_factory.getbasetemp() / "mutated.ply"
