@@ -17,6 +17,7 @@ from train.simulate.bench_command import add_verb as add_bench_verb
 from train.simulate.command import add_verb
 from train.simulate.look_command import add_verbs as add_look_verbs
 from train.simulate.rig_command import add_verb as add_rig_verb
+from train.simulate.street_command import add_verb as add_street_verb
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,6 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     add_fit_verb(verbs)
     add_verb(verbs)
     add_rig_verb(verbs)
+    add_street_verb(verbs)
     add_bench_verb(verbs)
     add_look_verbs(verbs)
     add_evaluate_verb(verbs)

@@ -93,16 +93,27 @@ def as_dict(pipeline: Road, tally: Tally, pictures: Sequence[Path], notes: Seque
     }
 
 
-def lines(pipeline: Road, tally: Tally, notes: Sequence[str]) -> list[str]:
-    """The whole report for people."""
+def account_lines(pipeline: Road) -> list[str]:
+    """The account of every radar's frames, for people."""
     text = [f"{'radar':<12}{'frames in':>10}{'ok':>8}{'lost':>8}  causes"]
     for radar, ledger in pipeline.ledgers.items():
         account = ledger.snapshot()
         causes = ", ".join(f"{cause.value} {count}" for cause, count in account.lost.items())
         text.append(f"{radar:<12}{account.frames_in:>10}{account.frames_ok:>8}{account.frames_lost:>8}  {causes}")
-    text += ["", f"{'stage':<12}{'calls':>10}{'p50 ms':>10}{'p99 ms':>10}"]
+    return text
+
+
+def stage_lines(pipeline: Road) -> list[str]:
+    """The stages' latencies, for people."""
+    text = [f"{'stage':<12}{'calls':>10}{'p50 ms':>10}{'p99 ms':>10}"]
     for stage, time in pipeline.times.summary().items():
         text.append(f"{stage:<12}{time.count:>10}{time.p50_us / 1e3:>10.3f}{time.p99_us / 1e3:>10.3f}")
+    return text
+
+
+def lines(pipeline: Road, tally: Tally, notes: Sequence[str]) -> list[str]:
+    """The whole report for people."""
+    text = [*account_lines(pipeline), "", *stage_lines(pipeline)]
     found = ", ".join(f"{radar} {count}" for radar, count in tally.detections.items())
     text += ["", f"detections: {found or 'none'}; associated points: {tally.points}; windows: {tally.windows}"]
     text += [_shape_line(shape) for _, shape in sorted(tally.shapes.items())]

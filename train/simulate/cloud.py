@@ -243,7 +243,7 @@ def in_box(mesh: Mesh, xyz_m: Float32, rotation: Float64, translation_m: Float64
 
 
 def truth_in_frame(
-    drive: DriveBy, window: FusedCloud | None, pose: Pose | None, number: int = 0
+    drive: DriveBy, window: FusedCloud | ObjectCloud | None, pose: Pose | None, number: int = 0
 ) -> tuple[Float64, Float64]:
     """Rotation [3, 3] and translation [3] from the mesh's frame into an upright frame of the reported odometry.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.config import require
-from edge.frames import Float32, Float64, FusedCloud, Pose
+from edge.frames import Float32, Float64, FusedCloud, ObjectCloud, Pose
 from edge.rig import Rig
 from train.objects.mesh import ClassName, Mesh
 from train.objects.reference import ObjectRef
@@ -101,7 +101,9 @@ class Street:
     users: tuple[StreetUser, ...]
     drive: DriveBy
 
-    def truth_in_frame(self, number: int, window: FusedCloud | None, pose: Pose | None) -> tuple[Float64, Float64]:
+    def truth_in_frame(
+        self, number: int, window: FusedCloud | ObjectCloud | None, pose: Pose | None
+    ) -> tuple[Float64, Float64]:
         """Rotation [3, 3] and translation [3] from the mesh of user ``number`` into a frame of the reported odometry.
 
         Args:
