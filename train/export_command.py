@@ -157,16 +157,25 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
 
 
 def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, str]:
-    source, target = options.source.resolve().parent.name, options.target.name
+    source, target = options.source.resolve().parent.name, options.name or options.target.name
     start, data = settings.get("start", ""), settings.get("data", {})
-    more = f" --start runs/{Path(start).parent.name}/{Path(start).name}" if start else ""
+    more = "".join(f" --option {key}={_plain(value)}" for key, value in settings.get("options", {}).items())
+    more += "" if settings.get("precision", "fp32") == "fp32" else f" --precision {settings['precision']}"
+    more += f" --start runs/{Path(start).parent.name}/{Path(start).name}" if start else ""
     if "simulated_share" in data:
         more += f" --simulated DRIVE_BYS --simulated-share {data['simulated_share']:g}"
+    sets = " --simulated DRIVE_BYS" if options.simulated else ""
+    sets += f" --confidence {options.confidence.name}" if options.confidence else ""
     given: Callable[[str], str] = lambda name: f"--{name.replace('_', '-')} {getattr(options, name)}"  # noqa: E731
     return {
         "fit": f"rfconstruct-train fit runs/{source} --network {settings.get('network', 'ours')} "
         f"--width {settings['width']} --minutes {settings['budget_s'] / 60:g} --batch {settings['batch']} "
         f"--rate {settings['rate']:g} --seed {settings['seed']}{more}",
         "export": f"rfconstruct-train export runs/{source}/checkpoint.pt models/{target} "
-        + " ".join(given(name) for name in ("samples", "emd_samples", "bank")),
+        + " ".join(given(name) for name in ("samples", "emd_samples", "bank"))
+        + sets,
     }
+
+
+def _plain(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
