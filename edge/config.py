@@ -230,7 +230,8 @@ class ObjectSettings:
         core_points: a point with at least this many neighbours (itself included) grows its object.
         min_points: smaller clusters are clutter.
         ground_clearance_m: points lower than this take no part in clustering; they join the nearest object after it.
-        max_extent_m: longer clusters are not road users and are dropped (and counted).
+        max_extent_m: longer clusters are not road users. They are clustered again with links shorter by a quarter, down
+            to ``least_neighbour_m``: neighbours along a kerb come apart; what stays too long is dropped (and counted).
         match_m: an object this close to one of the window before keeps its identity.
         forget_s: an identity unseen for longer is retired.
     """
@@ -240,6 +241,7 @@ class ObjectSettings:
     min_points: int = 24
     ground_clearance_m: float = 0.15
     max_extent_m: float = 8.0
+    least_neighbour_m: float = 0.3
     match_m: float = 1.5
     forget_s: float = 5.0
 
@@ -249,6 +251,8 @@ class ObjectSettings:
         require(self.min_points >= 1, "objects.min_points", self.min_points, ">= 1")
         require(0 <= self.ground_clearance_m <= 1, "objects.ground_clearance_m", self.ground_clearance_m, "0..1")
         require(self.max_extent_m > 0, "objects.max_extent_m", self.max_extent_m, "> 0")
+        least_m = self.least_neighbour_m
+        require(0 < least_m <= 10, "objects.least_neighbour_m", least_m, "0 < least_neighbour_m <= 10")
         require(self.match_m >= 0, "objects.match_m", self.match_m, ">= 0")
         require(0 <= self.forget_s <= 3600, "objects.forget_s", self.forget_s, "0..3600")
 

@@ -17,6 +17,8 @@ from edge.odometry.transforms import rotation_matrix
 from edge.odometry.vehicle import in_vehicle
 
 FARTHEST_M = 10_000.0
+SHORTER = 0.75
+"""Of the links of a cluster that is too long, at every further try."""
 _UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 _BEARING_RAD = np.arange(kernels.EXTENT_DIRECTIONS) * np.pi / kernels.EXTENT_DIRECTIONS
 _DIRECTION = np.ascontiguousarray(np.stack([np.cos(_BEARING_RAD), np.sin(_BEARING_RAD)], axis=1))
@@ -109,17 +111,30 @@ class ObjectTracker:
         labels = np.empty(len(xyz_m), np.int32)
         found, joined = np.empty(len(plane_m), np.int32), np.empty(len(low_m), np.int32)
         kernels.dbscan(plane_m, self._settings.neighbour_m, self._settings.core_points, self._grid, found)
+        self._split(plane_m, found)
         kernels.nearest_labels(low_m, plane_m, self._settings.neighbour_m, self._grid, found, joined)
         labels[standing], labels[~standing] = found, joined
         return labels, standing
 
+    def _split(self, plane_m: Float64, labels: NDArray[np.int32]) -> None:
+        """Cluster what is too long again with shorter links; ``labels`` [n] is changed in place and stays gapless."""
+        settings, radius_m = self._settings, self._settings.neighbour_m
+        while (radius_m := radius_m * SHORTER) >= settings.least_neighbour_m:
+            _, extent_m = _measured(plane_m, labels)
+            if not (extent_m > settings.max_extent_m).any():
+                return
+            for label in np.flatnonzero(extent_m > settings.max_extent_m):
+                member = np.flatnonzero(labels == label)
+                parts = np.empty(len(member), np.int32)
+                part_m = np.ascontiguousarray(plane_m[member])
+                kernels.dbscan(part_m, radius_m, settings.core_points, self._grid, parts)
+                labels[member] = np.where(parts < 0, -1, parts + labels.max() + 1)
+            _, gapless = np.unique(labels[labels >= 0], return_inverse=True)
+            labels[labels >= 0] = gapless
+
     def _keep(self, xyz_m: Float64, labels: NDArray[np.int32], standing: NDArray[np.bool_]) -> list[int]:
         """Labels of the clusters that are objects; fills the report."""
-        clusters = int(labels.max(initial=-1)) + 1
-        count, extent_m = np.empty(clusters, np.int64), np.empty(clusters, np.float64)
-        span_m = np.empty((clusters, len(_DIRECTION), 2), np.float64)
-        plane_m = np.ascontiguousarray(xyz_m[standing, :2])
-        kernels.measure(plane_m, labels[standing], _DIRECTION, count, span_m, extent_m)
+        count, extent_m = _measured(np.ascontiguousarray(xyz_m[standing, :2]), labels[standing])
         too_small = count < self._settings.min_points
         too_long = ~too_small & (extent_m > self._settings.max_extent_m)
         kept = np.flatnonzero(~too_small & ~too_long)
@@ -129,7 +144,7 @@ class ObjectTracker:
             in_objects=in_objects,
             dropped=len(labels) - in_objects - loose,
             loose=loose,
-            clusters=clusters,
+            clusters=len(count),
             objects=len(kept),
             too_small=int(too_small.sum()),
             too_long=int(too_long.sum()),
@@ -158,3 +173,12 @@ class ObjectTracker:
             age_s=self._identities.age_s(identity),
             pose_vehicle=None if cloud.last is None else in_vehicle(pose, cloud.last, self._geometry),
         )
+
+
+def _measured(plane_m: Float64, labels: NDArray[np.int32]) -> tuple[NDArray[np.int64], Float64]:
+    """Points and largest width in metres of every cluster of points [n, 2]."""
+    clusters = int(labels.max(initial=-1)) + 1
+    count, extent_m = np.empty(clusters, np.int64), np.empty(clusters, np.float64)
+    span_m = np.empty((clusters, len(_DIRECTION), 2), np.float64)
+    kernels.measure(plane_m, labels, _DIRECTION, count, span_m, extent_m)
+    return count, extent_m

@@ -186,6 +186,21 @@ def test_walls_and_specks_are_dropped_and_counted() -> None:
         assert (report.in_objects, report.dropped, report.loose) == (len(car), len(wall) + 23, 1)
 
 
+def test_neighbours_along_a_kerb_that_links_join_come_apart() -> None:
+    """Two cars 0.7 m apart: one chain of 0.8 m links, 9 m long; links of 0.6 m tell them apart. One car is not cut."""
+    length = CAR_M[0]
+    first, second = box(8.0, 0.0, CAR_M), box(8.0 + length + 0.7, 0.0, CAR_M)
+    seg = tracker()
+    found = seg.process(cloud(np.concatenate([first, second])))
+    assert [len(one) for one in found] == [len(first), len(second)]
+    assert (seg.last_report.clusters, seg.last_report.too_long) == (2, 0)
+    (joined,) = tracker(max_extent_m=30.0).process(cloud(np.concatenate([first, second])))
+    assert len(joined) == len(first) + len(second)
+    seg = tracker(least_neighbour_m=0.8)  # no shorter links: dropped as before
+    assert seg.process(cloud(np.concatenate([first, second]))) == []
+    assert (seg.last_report.clusters, seg.last_report.too_long) == (1, 1)
+
+
 def test_points_on_one_spot_are_one_object_without_extent() -> None:
     (found,) = tracker().process(cloud(np.tile([5.0, 1.0, 1.0], (20_000, 1))))
     np.testing.assert_allclose(found.xyz_m, np.tile([0.0, 0.0, 1.0], (20_000, 1)), atol=1e-6)
