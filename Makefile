@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-# `make run` shows the whole road on an embedded scene; `make test` runs every check. Both set themselves up.
+# `make run` drives past a simulated street, live; `make test` runs every check. Both set themselves up.
+# make run ARGS=--view: with the viewer's page beside it.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 OUT ?= out/run
+ARGS ?=
 
 .PHONY: run test slow lint clean
 
 run: $(VENV)/.edge
-	$(BIN)/rfconstruct demo --plot $(OUT)
+	$(BIN)/rfconstruct-train street --out $(OUT) $(ARGS)
 
 test: $(VENV)/.test lint
 	$(BIN)/python -m pytest

@@ -92,6 +92,7 @@ class _Drive:
 
     Args:
         shift_ns: by which the source's instants are later than the street's.
+        wall_s: when the first and the last item came.
         recording: of the results; None: there is none.
     """
 
@@ -101,6 +102,7 @@ class _Drive:
     log: ShapeLog
     pictures: RoadPictures | None
     shift_ns: int = 0
+    wall_s: tuple[float, float] = (0.0, 0.0)
     recording: Path | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -174,8 +176,11 @@ class _Drive:
         """What the source gives; the first item, a pose, tells by how much its clock is later."""
         poses = iter(self.street.drive.poses[:1])
         for item in self.source:
+            now_s = time.monotonic()
             for first in poses:
                 self.shift_ns = getattr(item, "t_ns", first.t_ns) - first.t_ns
+                self.wall_s = (now_s, now_s)
+            self.wall_s = (self.wall_s[0], now_s)
             yield item
 
     @property
@@ -196,8 +201,8 @@ class _Drive:
         from edge.commands.report import account_lines, stage_lines
         from train.simulate.street_report import lines
 
-        pipeline, late = self.session.pipeline, self.source.late.total()
-        text = ["", *account_lines(pipeline), f"simulator: {late} frames were made late, {self._rate()}"]
+        pipeline = self.session.pipeline
+        text = ["", *account_lines(pipeline), self._pace()]
         text += ["", *stage_lines(pipeline), "", *lines(self.street, findings, self.x_m), ""]
         text += [f"note: {note}" for note in (*self.session.notes, *self.notes)]
         text += [f"{path}" for path in files]
@@ -218,13 +223,15 @@ class _Drive:
         report["recording"] = str(self.recording) if self.recording is not None else None
         return {**report, "elapsed_s": round(elapsed_s, 1), "simulated": True}
 
-    def _rate(self) -> str:
-        """Pairs a second that became points, by the clock of the measurement."""
-        ok = min(ledger.snapshot().frames_ok for ledger in self.session.pipeline.ledgers.values())
-        if self.log.t_ns is None or self.log.t_ns <= self.shift_ns:
-            return "no pair became points"
-        seconds = self.street.drive.seconds(self.log.t_ns - self.shift_ns)
-        return f"{ok} pairs in {seconds:.1f} s of the drive"
+    def _pace(self) -> str:
+        """Pairs a second of the clock on the wall, and the frames that were not made in time."""
+        frames = min(ledger.snapshot().frames_in for ledger in self.session.pipeline.ledgers.values())
+        taken_s = max(self.wall_s[1] - self.wall_s[0], 1e-9)
+        late, reads = self.source.late.total(), self.source.slow_reads
+        return (
+            f"simulator: {frames / taken_s:.1f} pairs a second for {taken_s:.1f} s; frames that came over 4 ms late: "
+            f"{late} not made in time, {reads} not taken in time"
+        )
 
     def exit_code(self) -> int:
         """Of the verb."""

@@ -14,17 +14,17 @@ from edge.frames import Float32, Float64
 from edge.odometry.transforms import transform_points
 from edge.pipeline import FrameResult, WindowResult
 from edge.plot.collector import PictureCollector
-from edge.plot.figure import BOTH, COARSE, GRID, HORIZONTAL, INK, INPUT, MUTED, VERTICAL, dress, new_figure, write
+from edge.plot.figure import BOTH, COARSE, HORIZONTAL, INK, INPUT, MUTED, VERTICAL, dress, new_figure, write
 from edge.plot.shapes import shape_picture
 from edge.recording.point_files import write_points
 from train.simulate.street import Street
 from train.simulate.street_report import Finding, name
 
 COLOURS = {"car": HORIZONTAL, "bicycle": BOTH, "motorcycle": VERTICAL, "pedestrian": COARSE}
-"""By class of the shape; of an unknown one it is grey."""
+"""By class of the shape."""
+TRUTH = "#c3c9d1"
 SHOWN_POINTS = 6000
 """Of a shape in the picture of the street."""
-VIEWS = (("from above", 1, "left  y (m)"), ("from the road", 2, "up  z (m)"))
 
 
 class RoadPictures:
@@ -116,7 +116,7 @@ def write_pictures(folder: Path, street: Street, findings: Sequence[Finding], su
 
 
 def street_picture(path: Path, street: Street, findings: Sequence[Finding], subtitle: str) -> Path:
-    """The whole street from above and from the road: true surfaces, radar points, shapes, the rig's way.
+    """The whole street: radar points from the road, shapes from the road and from above, all on the true surfaces.
 
     Args:
         path: of the PNG.
@@ -124,52 +124,55 @@ def street_picture(path: Path, street: Street, findings: Sequence[Finding], subt
     """
     rng = np.random.default_rng(0)
     truths = [user.points_m(SHOWN_POINTS, rng) for user in street.users]
-    drive = street.drive
-    way_m = np.array([drive.true_pose(t_ns).position_m for t_ns in drive.span_ns])
-    low = min(float(way_m[0, 0]), *(float(t[:, 0].min()) for t in truths)) - 0.3
-    high = max(float(way_m[1, 0]), *(float(t[:, 0].max()) for t in truths)) + 0.3
-    deep = max(float(t[:, 1].max()) for t in truths) + 0.6
-    tall = max(float(t[:, 2].max()) for t in truths) + 0.9
-    unit_in = 12.4 / (high - low)
-    height_in = 2.5 + unit_in * (deep + 0.4 + 2.0 * tall)
-    figure = new_figure(13.0, height_in, "A street as the radars pass it", subtitle)
-    above, road, seen = figure.subplots(3, 1, height_ratios=(deep + 0.4, tall, tall))
-    for axes, (title, up, label) in zip((above, road, seen), (*VIEWS, VIEWS[1]), strict=True):
-        shown = title if axes is not seen else "radar points, from the road"
-        _panel(axes, findings, truths, up, points_only=axes is seen)
-        dress(axes, shown, "along the street  x (m)" if axes is seen else "", label)
-        axes.set_xlim(low, high)
-        axes.set_ylim(*((-0.4, deep) if up == 1 else (0.0, tall)))
-        axes.set_aspect("equal")
-    above.annotate("", way_m[1, :2], way_m[0, :2], arrowprops={"arrowstyle": "->", "color": INK, "linewidth": 1.2})
-    above.text(float(way_m[:, 0].mean()), 0.15, "way of the radars", fontsize=8, color=MUTED, ha="center")
-    _names(road, findings, tall)
+    lows, highs = np.min([t.min(axis=0) for t in truths], axis=0), np.max([t.max(axis=0) for t in truths], axis=0)
+    across, up = (float(lows[1]) - 0.9, float(highs[1]) + 0.5), (0.0, float(highs[2]) + 1.0)
+    way_m = [float(street.drive.true_pose(t_ns).position_m[0]) for t_ns in street.drive.span_ns]
+    along = (min(way_m[0], float(lows[0])) - 0.3, max(way_m[1], float(highs[0])) + 0.3)
+    unit_in = 12.2 / (along[1] - along[0])
+    heights = (up[1], up[1], across[1] - across[0])
+    figure = new_figure(13.0, 2.7 + unit_in * sum(heights), "A street, as the radars pass it", subtitle)
+    points, shapes, above = figure.subplots(3, 1, height_ratios=heights)
+    for axes, axis, title, limits in (
+        (points, 2, "Radar points, seen from the road", up),
+        (shapes, 2, "Completed shapes, seen from the road: class, confidence, Chamfer distance to the truth", up),
+        (above, 1, "Completed shapes from above", across),
+    ):
+        _panel(axes, findings, truths, axis, points_only=axes is points)
+        dress(axes, title, "along the street  x (m)" if axes is above else "", "up  z (m)" if axis == 2 else "y (m)")
+        axes.set(xlim=along, ylim=limits, aspect="equal")
+    way = {"arrowstyle": "->", "color": INK, "linewidth": 1.4}
+    above.annotate("", (way_m[1], across[0] + 0.15), (way_m[0], across[0] + 0.15), arrowprops=way)
+    above.text(way_m[0] + 0.1, across[0] + 0.25, "the radars drive at y = 0", fontsize=8, color=INK)
+    _names(shapes, findings, up[1])
     return write(figure, path)
 
 
 def _panel(axes: Any, findings: Sequence[Finding], truths: Sequence[Float32], up: int, points_only: bool) -> None:
     """True surfaces in light grey below, then radar points, or shapes in the colour of their class."""
     for truth in truths:
-        axes.scatter(truth[:, 0], truth[:, up], s=1.0, c=GRID, linewidths=0, rasterized=True)
+        axes.scatter(truth[:, 0], truth[:, up], s=1.0, c=TRUTH, linewidths=0)
     for one in findings:
         if points_only:
             placed = _placed(one, one.shape.input.xyz_m)
-            axes.scatter(placed[:, 0], placed[:, up], s=5.0, c=INPUT, alpha=0.6, linewidths=0, rasterized=True)
+            axes.scatter(placed[:, 0], placed[:, up], s=5.0, c=INPUT, alpha=0.6, linewidths=0)
         else:
             placed = _placed(one, one.shape.fine_m[:: max(1, len(one.shape.fine_m) // SHOWN_POINTS)])
-            colour = COLOURS.get(one.shape.class_name, MUTED)
-            axes.scatter(placed[:, 0], placed[:, up], s=0.9, c=colour, alpha=0.6, linewidths=0, rasterized=True)
+            axes.scatter(placed[:, 0], placed[:, up], s=1.2, c=_colour(one), alpha=0.5, linewidths=0)
+
+
+def _colour(one: Finding) -> str:
+    """Of the class, or of the most likely one when the network is not sure."""
+    return next((colour for kind, colour in COLOURS.items() if kind in class_text(one.shape)), MUTED)
 
 
 def _names(axes: Any, findings: Sequence[Finding], tall: float) -> None:
-    """What the network says of every object, above it; neighbours at two heights."""
+    """What the network says of every object, above it; neighbours at three heights."""
     centres = [float(_placed(one, one.shape.fine_m)[:, 0].mean()) for one in findings]
     for rank, index in enumerate(np.argsort(centres)):
         one = findings[int(index)]
         text = f"{one.shape.identity}: {class_text(one.shape)} {one.shape.confidence:.2f}, {one.shape_cm:.1f} cm"
-        colour = COLOURS.get(one.shape.class_name, MUTED)
-        height = tall - (0.1 if rank % 2 else 0.45)
-        axes.text(centres[int(index)], height, text, fontsize=8, color=colour, ha="center", va="top")
+        height = tall - 0.1 - 0.27 * (rank % 3)
+        axes.text(centres[int(index)], height, text, fontsize=8, color=_colour(one), ha="center", va="top")
 
 
 def _placed(one: Finding, points_m: Float32) -> Float64:
