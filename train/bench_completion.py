@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from edge.bench.measure import Timing, measure, processor
-from edge.bench.report import table
-from edge.bench.startup import start
 from edge.completion.manifest import Manifest, find_model, read_files, read_manifest
 from edge.completion.network import Network
 from edge.config import require
@@ -42,6 +40,8 @@ def add_verb(verbs: argparse._SubParsersAction[Any]) -> None:
 def run(options: argparse.Namespace) -> int:
     """Measure and print."""
     import torch
+
+    from edge.bench.startup import start
 
     require(options.seconds > 0, "--seconds", options.seconds, "> 0 s")
     torch.set_num_threads(1)
@@ -122,6 +122,8 @@ def naive(network: CompletionNetwork, points_m: Tensor) -> Tensor:
 
 
 def _lines(manifest: Manifest, times: dict[str, Timing], resident_mb: float) -> Iterator[str]:
+    from edge.bench.report import table  # it brings the signal path
+
     ours = times[manifest.default_file].median_ms
     about = {file: f"shipped, {one.precision}, {one.size / 1e6:.1f} MB" for file, one in manifest.files.items()}
     about |= {

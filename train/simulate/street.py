@@ -15,7 +15,6 @@ from edge.rig import Rig
 from train.objects.mesh import ClassName, Mesh
 from train.objects.reference import ObjectRef
 from train.objects.sampling import sample_surface
-from train.simulate.cloud import truth_in_frame
 from train.simulate.drive_by import DriveBy
 from train.simulate.scene import footprint
 from train.simulate.settings import SimulationSettings, TrackSettings
@@ -110,6 +109,8 @@ class Street:
             number: index into ``users``.
             window, pose: of an ``ObjectCloud`` or a shape; see ``cloud.truth_in_frame``.
         """
+        from train.simulate.cloud import truth_in_frame  # it brings the whole pipeline
+
         return truth_in_frame(self.drive, window, pose, number)
 
     def nearest(self, window: FusedCloud, pose: Pose) -> tuple[int, float]:

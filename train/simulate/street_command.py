@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -68,19 +69,33 @@ def run(options: argparse.Namespace, settings: StreetSettings | None = None) -> 
     """
     from edge.errors import ConfigError
 
-    start_s = time.monotonic()
     if not 0 <= options.pace < 1e6:
         raise ConfigError("street", value=f"--pace {options.pace:g}", allowed="0 or more")
     _make_folder(options.out)
+    try:
+        return _drive(options, settings)
+    except KeyboardInterrupt:
+        print("rfconstruct-train street: interrupted", file=sys.stderr)
+        return 130
+
+
+def _drive(options: argparse.Namespace, settings: StreetSettings | None) -> int:
+    """Kernels, drive, closing table, files."""
+    from train.simulate.warm import is_cold, warm_both
+
+    start_s = time.monotonic()
+    if is_cold():
+        _say(options, "first start: kernels are being compiled")
+        _say(options, f"compiled in {warm_both(options.rig):.0f} s")
     drive = _Drive.make(options, settings)
     with ExitStack() as stack:
         viewer = drive.play(options, stack)
         findings = drive.findings()
         files = _files(options, drive, findings)
+        elapsed_s = time.monotonic() - start_s
         if options.json:
-            print(json.dumps(drive.as_dict(findings, files, time.monotonic() - start_s), indent=2))
-        else:
-            print("\n".join(drive.lines(findings, files, time.monotonic() - start_s)), flush=True)
+            print(json.dumps(drive.as_dict(findings, files, elapsed_s), indent=2))
+        _say(options, "\n".join(drive.lines(findings, files, elapsed_s)))
         if viewer is not None and viewer.running and not drive.session.stopped():
             _keep(viewer, drive.session)
     return drive.exit_code()
@@ -267,6 +282,11 @@ def _keep(viewer: Viewer, session: Session) -> None:
     session.say("the viewer's page stays until Ctrl-C")
     with Interrupts() as interrupts:
         viewer.wait(interrupts.asked)
+
+
+def _say(options: argparse.Namespace, text: str) -> None:
+    if not options.json:
+        print(text, flush=True)
 
 
 def _make_folder(folder: Path) -> None:
