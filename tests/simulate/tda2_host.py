@@ -76,6 +76,8 @@ class Host:
     interrupts: dict[int, int] = field(default_factory=dict)
     events: list[tuple[int, int, bytes]] = field(default_factory=list)
     sequence: dict[int, int] = field(default_factory=dict)
+    before_sync: bytes = b""
+    """What a chip sent before the sync word of its last message."""
 
     def __post_init__(self) -> None:
         self.socket = socket.create_connection(self.address, timeout=SAFETY_S)
@@ -143,13 +145,18 @@ class Host:
         """One message of a chip: interrupt, CNYS, sync, header, payload, CRC."""
         self.wait_interrupt(device)
         assert self.order(0x23, device, READ_REQUEST) == ACK
-        assert self.spi_read(device, 4) == bytes.fromhex("badccdab")
+        self.before_sync = self.spi_read(device, 4)
+        while not self.before_sync.endswith(bytes.fromhex("badccdab")):
+            self.before_sync += self.spi_read(device, 1)
+        self.before_sync = self.before_sync[:-4]
         header = self.spi_read(device, 12)
         opcode, length, flags, _, count, check = struct.unpack("<6H", header)
         assert check == ones_complement(struct.unpack("<5H", header[:10]))
-        payload = self.spi_read(device, length - 16) if length > 16 else b""
-        crc = self.spi_read(device, 4)
-        assert int.from_bytes(crc, "little") == zlib.crc32(header + payload)
+        assert flags & 0x0F00 in (0, 0x0400), "CRC-16 or CRC-32"
+        size = 4 if flags & 0x0400 else 2
+        payload = self.spi_read(device, length - 12 - size) if length > 12 + size else b""
+        crc = self.spi_read(device, size)
+        assert int.from_bytes(crc, "little") == (zlib.crc32 if size == 4 else crc16)(header + payload)
         blocks, rest = [], payload
         for _ in range(count):
             block, size = struct.unpack_from("<HH", rest)
@@ -237,6 +244,7 @@ def load_firmware(host: Host, device: int) -> None:
     image = struct.pack("<II", 0, 7936) + b"MSTR" + bytes(7932)
     for index in range(35):
         host.good(device, 5, 0x204, 0x4080, image[232 * index : 232 * (index + 1)], 34 - index)
+    assert host.event(device, 0x5005) == bytes(24), "boot status: no fault"
 
 
 def configure(host: Host, device: int, loops: int, samples: int, frames: int, profile: bytes | None = None) -> None:

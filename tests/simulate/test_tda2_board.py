@@ -24,10 +24,12 @@ from tda2_captures import (
     run_capture,
     supply,
 )
-from tda2_host import ACK, VERSION, Host
+from tda2_host import ACK, VERSION, Host, Received
 
 from edge.frames import Layout
 from edge.sources.ti_index import read_index
+from train.simulate.faults import Faults
+from train.simulate.rhcp import Direction, Kind, Message, SubBlock
 
 
 @pytest.fixture
@@ -107,11 +109,55 @@ def test_golden_answers_bit_by_bit(make: Make) -> None:
         for text in ("0400 82c3", "0c00 2b4a", "2400 64c5"):
             host.send(hexes("12000000 c8a5240000000e00010100000000") + hexes(text))
             parts.append(host.answer()[3])
-        parts.append(host.spi_read(1, 4))
+        parts.append(host.spi_read(1, 2))
         assert parts[0] == hexes("badccdab")
-        assert parts[1] == hexes("36a03400000400000100945b"), "MSS powered up"
+        assert parts[1] == hexes("36a032000c00000001008a5f"), "MSS powered up; the logged event's header"
         assert parts[2] == hexes("00502400") + bytes(32)
-        assert parts[3] == hexes("855f3afb")
+        assert int.from_bytes(parts[3], "little") == h.crc16(parts[1] + parts[2])
+
+
+def test_event_of_a_chip_whose_crc_type_was_not_set() -> None:
+    """CPU fault as a user logged it (TI E2E 1267477), and the notes' power-up event with CRC-32."""
+    data = hexes("05000000800000fe") + bytes(16) + b"\xff" * 6 + bytes(2)
+    fault = Message(Direction.FROM_MSS, Kind.EVENT, 0x280, blocks=(SubBlock(0x5002, data),))
+    assert fault.to_bytes(False) == hexes("36a032000c00000001008a5f 02502400") + data + hexes("f4b5")
+    powered = Message(Direction.FROM_MSS, Kind.EVENT, 0x280, blocks=(SubBlock(0x5000, bytes(32)),))
+    assert powered.to_bytes() == hexes("36a03400000400000100945b 00502400") + bytes(32) + hexes("855f3afb")
+
+
+def flags(message: Received) -> int:
+    """Of a message's header, without the sequence number."""
+    return int.from_bytes(message.raw[4:6], "little") & 0x0FFF
+
+
+def test_crc_16_until_the_crc_type_is_set(make: Make) -> None:
+    board = make()
+    with Host(board.address) as host:
+        h.connect(host)
+        h.boot(host, 1)
+        assert flags(host.good(1, 5, 0x207, 0x40E0)) == 0
+        host.good(1, 5, 0x202, 0x404C, hexes("010000000000000000000000"))
+        assert flags(host.good(1, 5, 0x207, 0x40E0)) == 0x0400
+        host.good(1, 5, 0x200, 0x4000)
+        host.event(1, 0x5001)
+        assert board.violations == []
+        host.order(0x20, 1)
+        assert host.read(1).raw[4:6] == hexes("0c00"), "a reset chip has forgotten it"
+
+
+def test_other_bytes_before_the_sync_word(make: Make) -> None:
+    faults = Faults(seed=3)
+    faults.set("babble", "horizontal/spi", value=4096, times=3)
+    board = make(faults=faults)
+    with Host(board.address) as host:
+        h.connect(host)
+        assert host.order(0x21, 1, struct.pack("<I", 4)) == ACK
+        assert host.order(0x20, 1) == ACK
+        host.event(1, 0x5000)
+        assert len(host.before_sync) == 100, "at most"
+        h.load_firmware(host, 1)
+        assert host.before_sync == b""
+        assert board.violations == []
 
 
 def test_golden_profile_answer_and_start(make: Make) -> None:

@@ -179,7 +179,7 @@ class CascadeChip:
 
     def _post(self, message: Message, delay_s: float = 0.0) -> None:
         def put() -> None:
-            self.outbox.append(message.to_bytes())
+            self.outbox.append(message.to_bytes(c.CRC_TYPE in self._done))
             self._signal()
 
         self._after(delay_s, put)
@@ -284,7 +284,9 @@ class CascadeChip:
 
     def _follow(self, block: SubBlock) -> None:
         """What an accepted command sets in motion, after its answer."""
-        if block.identity == c.RF_POWER:
+        if block.identity == c.FILE and c.FILE in self._done:
+            self._event(c.BOOT_STATUS, bytes(24))
+        elif block.identity == c.RF_POWER:
             self._after(self._delays.rf_power_up_s, lambda: self._event(c.RF_POWER_UP, bytes(32)))
         elif block.identity == c.INIT:
             asked = struct.unpack_from("<H", self.settings.get(c.CALIBRATIONS, b"\xf0\x1f"))[0]

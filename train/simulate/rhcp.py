@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The radar chips' own protocol inside the SPI packets: headers, sub-blocks, checksum and CRC-32, as the chip sees it.
+"""The radar chips' own protocol inside the SPI packets: headers, sub-blocks, checksum and CRC, as the chip sees it.
 
 Source: TI Radar Interface Control Document 2.23. Little endian; header of six u16 (opcode, length, flags, remaining
-chunks, number of sub-blocks, checksum), sub-blocks ``{u16 id, u16 length, data}``, CRC-32 over header and payload.
+chunks, number of sub-blocks, checksum), sub-blocks ``{u16 id, u16 length, data}``, CRC over header and payload: CRC-32
+from the host; CRC-16/CCITT-FALSE from a chip whose CRC type was not set (event logged by a user, TI E2E 1267477).
 """
 
 from __future__ import annotations
 
+import binascii
 import struct
 import zlib
 from collections.abc import Sequence
@@ -22,6 +24,8 @@ CRC_BYTES = 4
 LONGEST_MESSAGE = 256
 """With the sync word."""
 FLAGS_CRC32 = 0x0400
+_FLAGS_LOGGED = 0x000C
+"""Of the logged event with CRC-16: no acknowledgement wanted."""
 _RETRY_BITS = 0x0003
 
 
@@ -134,15 +138,21 @@ class Message:
     remaining: int = 0
     count: int = 0
 
-    def to_bytes(self) -> bytes:
-        """Header, payload padded to 4 bytes with FF, CRC-32; without the sync word."""
+    def to_bytes(self, crc_32: bool = True) -> bytes:
+        """Header, payload padded to 4 bytes with FF, CRC-32 or CRC-16; without the sync word."""
         payload = b"".join(struct.pack("<2H", b.identity, 4 + len(b.data)) + b.data for b in self.blocks)
         payload += b"\xff" * (-len(payload) % 4)
         opcode = self.direction | self.kind << 4 | self.identity << 6
-        flags = FLAGS_CRC32 | self.sequence << 12
-        words = (opcode, HEADER.size + len(payload) + CRC_BYTES, flags, self.remaining, len(self.blocks))
+        flags = FLAGS_CRC32 if crc_32 else _FLAGS_LOGGED if self.kind == Kind.EVENT else 0
+        length = HEADER.size + len(payload) + (CRC_BYTES if crc_32 else 2)
+        words = (opcode, length, flags | self.sequence << 12, self.remaining, len(self.blocks))
         body = struct.pack("<6H", *words, checksum(words)) + payload
-        return body + struct.pack("<I", zlib.crc32(body))
+        return body + (struct.pack("<I", zlib.crc32(body)) if crc_32 else struct.pack("<H", crc16(body)))
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE: polynomial 0x1021 from 0xFFFF."""
+    return binascii.crc_hqx(data, 0xFFFF)
 
 
 def checksum(words: Sequence[int]) -> int:

@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
+
 from edge.errors import CaptureError
 from edge.frames import RadarFrame, RadarId
 from train.simulate.capture_writer import ROLL_OVER_BYTES
@@ -32,6 +34,8 @@ from train.simulate.tda2_recorder import Recorder
 from train.simulate.threads import Bursts, Later
 
 FRAME_LSB_NS = 5
+MOST_BABBLE = 100
+"""Bytes of a chip before its sync word."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,9 +288,16 @@ class Tda2Board:
             if self._reading[number]:
                 self.complain(f"chip {number}: {len(self._reading[number])} bytes of the message before were not read")
             self._lines[number] = False
-            self._reading[number] = CHIP_SYNC + chip.outbox.popleft() if chip.outbox else b""
+            self._reading[number] = self._babble() + CHIP_SYNC + chip.outbox.popleft() if chip.outbox else b""
         else:
             chip.receive(data)
+
+    def _babble(self) -> bytes:
+        """What the chip sends before its sync word, where a fault wants it."""
+        other = self.faults.hit(Fault.BABBLE, f"{self.radar}/spi") if self.faults is not None else None
+        if not other:
+            return b""
+        return other.rng.integers(0x20, 0x7F, min(int(other.value), MOST_BABBLE), dtype=np.uint8).tobytes()
 
     def spi_read(self, number: int, count: int) -> bytes:
         """The next bytes of the message that is being read; FF where there is none."""
