@@ -30,6 +30,10 @@ LENGTH_M = 20.0
 """2.2 m between two road users: objects nearer to one another become one (``objects.neighbour_m``)."""
 DEPTH = 64
 """Frames and poses made ahead, half a second: a machine that does something else meanwhile costs no frame."""
+PAGE = "http://127.0.0.1:8080"
+"""Of ``rfconstruct view``."""
+KEPT_PACE = 0.98
+"""Below this share of real time a note says so."""
 MOST_LOST = 0.01
 """Share of the frames beyond which the exit code is 3."""
 
@@ -90,6 +94,7 @@ def _drive(options: argparse.Namespace, settings: StreetSettings | None) -> int:
     drive = _Drive.make(options, settings)
     with ExitStack() as stack:
         viewer = drive.play(options, stack)
+        drive.note_pace(options.pace)
         findings = drive.findings()
         files = _files(options, drive, findings)
         elapsed_s = time.monotonic() - start_s
@@ -108,6 +113,7 @@ class _Drive:
     Args:
         shift_ns: by which the source's instants are later than the street's.
         wall_s: when the first and the last item came.
+        cpu_s: processor time of this process then.
         recording: of the results; None: there is none.
     """
 
@@ -118,6 +124,7 @@ class _Drive:
     pictures: RoadPictures | None
     shift_ns: int = 0
     wall_s: tuple[float, float] = (0.0, 0.0)
+    cpu_s: tuple[float, float] = (0.0, 0.0)
     recording: Path | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -154,6 +161,7 @@ class _Drive:
 
     def play(self, options: argparse.Namespace, stack: ExitStack) -> Viewer | None:
         """Drive along; the viewer that was asked for ends with ``stack``."""
+        from edge.stream.client import DEFAULT_ENDPOINT
         from train.simulate.street_stream import ResultsRecording, Viewer
 
         endpoint = (options.endpoint or self.session.rig.settings.stream.endpoints)[0]
@@ -162,8 +170,8 @@ class _Drive:
             viewer = Viewer(endpoint, options.json)
             stack.callback(viewer.close)
         elif not options.no_publish:
-            where = "" if endpoint == "tcp://127.0.0.1:5600" else f" --endpoint {endpoint}"
-            self.session.say(f"viewer: rfconstruct view{where}, in another terminal, shows it on http://127.0.0.1:8080")
+            where = "" if endpoint == DEFAULT_ENDPOINT else f" --endpoint {endpoint}"
+            self.session.say(f"viewer: {_program()} view{where}, in another terminal; page: {PAGE}")
         if options.no_publish:
             self._run()
             return viewer
@@ -173,6 +181,16 @@ class _Drive:
         if recording.failure:
             self.notes.append(f"the recording is not whole: {recording.failure}")
         return viewer
+
+    def note_pace(self, pace: float) -> None:
+        """Say when the simulator was slower than ``pace``; the live pipeline then had more time than on a vehicle."""
+        seconds = 0.0 if self.log.t_ns is None else self.street.drive.seconds(self.log.t_ns - self.shift_ns)
+        taken_s = self.wall_s[1] - self.wall_s[0]
+        if pace > 0 and 1.0 < seconds < KEPT_PACE * pace * taken_s:
+            self.notes.append(
+                f"NOT IN REAL TIME: {seconds:.1f} s of the drive took {taken_s:.1f} s, because the simulator had too "
+                "little of this machine (other work on it? --rig cascade_demo needs a third)"
+            )
 
     def _run(self) -> None:
         try:
@@ -191,11 +209,11 @@ class _Drive:
         """What the source gives; the first item, a pose, tells by how much its clock is later."""
         poses = iter(self.street.drive.poses[:1])
         for item in self.source:
-            now_s = time.monotonic()
+            now_s, cpu_s = time.monotonic(), time.process_time()
             for first in poses:
                 self.shift_ns = getattr(item, "t_ns", first.t_ns) - first.t_ns
-                self.wall_s = (now_s, now_s)
-            self.wall_s = (self.wall_s[0], now_s)
+                self.wall_s, self.cpu_s = (now_s, now_s), (cpu_s, cpu_s)
+            self.wall_s, self.cpu_s = (self.wall_s[0], now_s), (self.cpu_s[0], cpu_s)
             yield item
 
     @property
@@ -220,9 +238,12 @@ class _Drive:
         text = ["", *account_lines(pipeline), self._pace()]
         text += ["", *stage_lines(pipeline), "", *lines(self.street, findings, self.x_m), ""]
         text += [f"note: {note}" for note in (*self.session.notes, *self.notes)]
-        text += [f"{path}" for path in files]
+        text += [f"picture: {path}" for path in files if path.suffix == ".png"]
+        clouds = [path for path in files if path.suffix == ".ply"]
+        if clouds:
+            text.append(f"PLY: {clouds[0].parent}/object_*_{{shape,points,truth}}.ply, {len(clouds)} files, one frame")
         if self.recording is not None:
-            text.append(f"{self.recording}: all results; rfconstruct view {self.recording} shows them again")
+            text.append(f"again: {_program()} view {self.recording}; page: {PAGE}")
         return [*text, f"{elapsed_s:.1f} s in all"]
 
     def as_dict(self, findings: list[Finding], files: list[Path], elapsed_s: float) -> dict[str, Any]:
@@ -243,9 +264,10 @@ class _Drive:
         frames = min(ledger.snapshot().frames_in for ledger in self.session.pipeline.ledgers.values())
         taken_s = max(self.wall_s[1] - self.wall_s[0], 1e-9)
         late, reads = self.source.late.total(), self.source.slow_reads
+        share = (self.cpu_s[1] - self.cpu_s[0]) / taken_s
         return (
-            f"simulator: {frames / taken_s:.1f} pairs a second for {taken_s:.1f} s; frames that came over 4 ms late: "
-            f"{late} not made in time, {reads} not taken in time"
+            f"simulator: {frames / taken_s:.1f} pairs a second for {taken_s:.1f} s; frames over 4 ms late: {late} not "
+            f"made in time, {reads} not taken\nsimulator and pipeline together: {100.0 * share:.0f} % of one core"
         )
 
     def exit_code(self) -> int:
@@ -282,6 +304,12 @@ def _keep(viewer: Viewer, session: Session) -> None:
     session.say("the viewer's page stays until Ctrl-C")
     with Interrupts() as interrupts:
         viewer.wait(interrupts.asked)
+
+
+def _program() -> str:
+    """``rfconstruct`` as it is called here."""
+    beside = Path(sys.argv[0]).with_name("rfconstruct")
+    return str(beside) if beside.is_file() else "rfconstruct"
 
 
 def _say(options: argparse.Namespace, text: str) -> None:
