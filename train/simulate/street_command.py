@@ -30,6 +30,8 @@ LENGTH_M = 20.0
 """2.2 m between two road users: objects nearer to one another become one (``objects.neighbour_m``)."""
 DEPTH = 64
 """Frames and poses made ahead, half a second: a machine that does something else meanwhile costs no frame."""
+LAST_POSES_NS = 100_000_000
+"""Poses go on for so long after the last frame, whose velocity they give."""
 PAGE = "http://127.0.0.1:8080"
 """Of ``rfconstruct view``."""
 KEPT_PACE = 0.98
@@ -112,7 +114,7 @@ class _Drive:
 
     Args:
         shift_ns: by which the source's instants are later than the street's.
-        wall_s: when the first and the last item came.
+        wall_s: when the first and the last frame came.
         cpu_s: processor time of this process then.
         recording: of the results; None: there is none.
     """
@@ -143,8 +145,10 @@ class _Drive:
         frames = drive.frames
         if options.seconds is not None:
             frames = max(1, min(frames, round(frames * options.seconds / drive.seconds(drive.span_ns[1]))))
+        last_ns = max(drive.t_first_chirp_ns(radar, frames - 1) for radar in drive.rig.radars)
+        poses = [pose for pose in drive.poses if pose.t_ns <= last_ns + LAST_POSES_NS]
         pace = options.pace
-        source = SimulatorSource(drive.rig, drive.frame, frames, drive.poses, pace=pace, depth=DEPTH, rebase=True)
+        source = SimulatorSource(drive.rig, drive.frame, frames, poses, pace=pace, depth=DEPTH, rebase=True)
         quiet = argparse.Namespace(**{**vars(options), "plot": None, "speed": 0.0})
         title = f"simulated street, rig {drive.rig.name}, seed {options.seed}"
         notes = ["simulated radar data; the odometry has errors too"]
@@ -174,12 +178,14 @@ class _Drive:
             self.session.say(f"viewer: {_program()} view{where}, in another terminal; page: {PAGE}")
         if options.no_publish:
             self._run()
-            return viewer
+            return None
         with ResultsRecording(endpoint, options.out / "street.mcap") as recording:
             self._run()
         self.recording = recording.path
         if recording.failure:
             self.notes.append(f"the recording is not whole: {recording.failure}")
+        if viewer is not None and viewer.failure():
+            self.notes.append(f"the viewer ended: {viewer.failure()}")
         return viewer
 
     def note_pace(self, pace: float) -> None:
@@ -212,8 +218,8 @@ class _Drive:
             now_s, cpu_s = time.monotonic(), time.process_time()
             for first in poses:
                 self.shift_ns = getattr(item, "t_ns", first.t_ns) - first.t_ns
-                self.wall_s, self.cpu_s = (now_s, now_s), (cpu_s, cpu_s)
-            self.wall_s, self.cpu_s = (self.wall_s[0], now_s), (self.cpu_s[0], cpu_s)
+            if hasattr(item, "adc"):
+                self.wall_s, self.cpu_s = (self.wall_s[0] or now_s, now_s), (self.cpu_s[0] or cpu_s, cpu_s)
             yield item
 
     @property
@@ -266,8 +272,8 @@ class _Drive:
         late, reads = self.source.late.total(), self.source.slow_reads
         share = (self.cpu_s[1] - self.cpu_s[0]) / taken_s
         return (
-            f"simulator: {frames / taken_s:.1f} pairs a second for {taken_s:.1f} s; frames over 4 ms late: {late} not "
-            f"made in time, {reads} not taken\nsimulator and pipeline together: {100.0 * share:.0f} % of one core"
+            f"simulator: {(frames - 1) / taken_s:.1f} pairs a second for {taken_s:.1f} s; over 4 ms late: {late} frames "
+            f"not made in time, {reads} not taken\nsimulator and pipeline together: {100.0 * share:.0f} % of one core"
         )
 
     def exit_code(self) -> int:

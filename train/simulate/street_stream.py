@@ -77,8 +77,14 @@ class Viewer:
         if importlib.util.find_spec("viser") is None:
             raise DependencyError("the viewer needs viser", action="pip install 'rfconstruct[view]'")
         words = [sys.executable, "-m", "edge", "view", "--endpoint", endpoint]
-        output = subprocess.DEVNULL if quiet else None
-        self._process = subprocess.Popen(words, stdout=output, stdin=subprocess.DEVNULL, start_new_session=True)
+        self._process = subprocess.Popen(
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL if quiet else None,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        self._failure = ""
 
     def wait(self, stopped: Callable[[], bool]) -> None:
         """Until it ends or ``stopped``."""
@@ -87,6 +93,13 @@ class Viewer:
                 self._process.wait(POLL_S)
             except subprocess.TimeoutExpired:
                 continue
+
+    def failure(self) -> str:
+        """What it said when it ended by itself; empty: it runs."""
+        if not self.running and self._process.stderr is not None and not self._process.stderr.closed:
+            with self._process.stderr as errors:
+                self._failure = errors.read().decode("utf-8", "replace").strip() or "without a word"
+        return self._failure
 
     @property
     def running(self) -> bool:
@@ -101,3 +114,5 @@ class Viewer:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        if self._process.stderr is not None:
+            self._process.stderr.close()
