@@ -74,9 +74,11 @@ class Layout:
       Slot s fires TX 12 - s (hardware: chirp table).
     * ``dca1000`` (single chip, channels not interleaved, two LVDS lanes): ``[loop, slot, rx, sample / 2, 4]`` where the
       innermost four are Q0 Q1 I0 I1 (``iq_order="QI"``) or I0 I1 Q0 Q1 (``"IQ"``); ``device`` is 1.
+    * ``dca1000_real`` (the same of a chip without a quadrature mixer, AWR2944): ``[loop, slot, rx, sample]``, real
+      samples; ``iq_order`` says nothing.
 
     Args:
-        kind: which of the two.
+        kind: which of the three.
         devices: radar chips (cascade 4, single chip 1).
         loops: repetitions of the chirp table in one burst.
         slots: chirps of one loop = transmitters that take turns.
@@ -85,7 +87,7 @@ class Layout:
         iq_order: "IQ" when I comes first, "QI" when Q does.
     """
 
-    kind: Literal["cascade", "dca1000"]
+    kind: Literal["cascade", "dca1000", "dca1000_real"]
     devices: int
     loops: int
     slots: int
@@ -98,7 +100,14 @@ class Layout:
         """Shape of the raw int16 array in the capture's own axis order."""
         if self.kind == "cascade":
             return (self.devices, self.loops, self.slots, self.samples, self.rx, 2)
+        if self.kind == "dca1000_real":
+            return (self.loops, self.slots, self.rx, self.samples)
         return (self.loops, self.slots, self.rx, self.samples // 2, 4)
+
+    @property
+    def parts(self) -> int:
+        """int16 values of one sample: I and Q, or 1 of real samples."""
+        return 1 if self.kind == "dca1000_real" else 2
 
     @property
     def channels(self) -> int:
@@ -108,7 +117,7 @@ class Layout:
     @property
     def int16_count(self) -> int:
         """int16 values of one frame."""
-        return self.loops * self.channels * self.samples * 2
+        return self.loops * self.channels * self.samples * self.parts
 
     @property
     def nbytes(self) -> int:

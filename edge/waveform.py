@@ -26,7 +26,7 @@ FRAME_TIME_LSB_S = 5e-9
 TRIGGER_MARGIN_S = 200e-6
 """External pulses must come after the programmed period is over: it is programmed shorter by this."""
 USABLE_IF_SHARE = 0.9
-"""Complex1x: the IF filter passes 0.9 of the sampling rate (ICD)."""
+"""The IF filter passes 0.9 of the sampling rate (complex1x, ICD), of half the rate with real samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,10 +231,14 @@ class ChirpProfile:
         return SPEED_OF_LIGHT_M_S / (2.0 * self.bandwidth_hz)
 
     @property
+    def highest_beat_hz(self) -> float:
+        """Beat frequencies from 0 to here are told apart: the sampling rate, of real samples half of it."""
+        return self.sample_rate_hz if self.chip.complex_samples else 0.5 * self.sample_rate_hz
+
+    @property
     def max_range_m(self) -> float:
-        """Range at the highest beat frequency: fs for complex, fs / 2 for real samples."""
-        highest_hz = self.sample_rate_hz if self.chip.complex_samples else 0.5 * self.sample_rate_hz
-        return SPEED_OF_LIGHT_M_S * highest_hz / (2.0 * self.slope_hz_per_s_actual)
+        """Range at the highest beat frequency."""
+        return SPEED_OF_LIGHT_M_S * self.highest_beat_hz / (2.0 * self.slope_hz_per_s_actual)
 
     @property
     def usable_range_m(self) -> float:
@@ -375,10 +379,13 @@ class Schedule:
         """Axis order of the capture.
 
         Raises:
-            ConfigError: the device samples real values, which no layout describes.
+            ConfigError: an odd number of samples from a DCA1000, which sends them in pairs.
         """
         chip = self.profile.chip
-        require(chip.complex_samples, "profile.device", chip.name, "a device with complex samples", "it has no layout")
-        kind: Literal["cascade", "dca1000"] = "cascade" if self.is_cascade else "dca1000"
+        in_pairs = self.is_cascade or self.profile.samples % 2 == 0
+        require(in_pairs, "profile.samples", self.profile.samples, "an even number")
+        kind: Literal["cascade", "dca1000", "dca1000_real"] = "cascade" if self.is_cascade else "dca1000"
+        if not chip.complex_samples:
+            return Layout("dca1000_real", chip.chips, self.loops, self.slots, self.profile.samples, chip.rx)
         order = self.iq_order or ("IQ" if self.is_cascade else "QI")
         return Layout(kind, chip.chips, self.loops, self.slots, self.profile.samples, chip.rx, order)

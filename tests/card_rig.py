@@ -48,9 +48,11 @@ class CardRig:
         drivers: not connected.
     """
 
-    def __init__(self, rig: Rig, root: Path, faults: Faults | None = None, **settings: Any) -> None:
+    def __init__(
+        self, rig: Rig, root: Path, faults: Faults | None = None, supply: CyclicSupply | None = None, **settings: Any
+    ) -> None:
         self.rig = rig
-        self.supply: CyclicSupply = targets(rig, count=3)
+        self.supply = supply or targets(rig, count=3)
         demo = DemoSettings(**{"start_s": 0.0, "restart_s": 0.0, "boot_s": 0.0, **settings.pop("demo", {})})
         card = Dca1000Settings(**{"deaf_s": 0.01, "flush_s": 2.0, **settings.pop("card", {})})
         chosen = VirtualRigSettings(demo=demo, card=card, **{"pace": 1.0, "links": root / "ports", **settings})

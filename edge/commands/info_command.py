@@ -154,7 +154,7 @@ def describe_rig(rig: Rig) -> list[str]:
     lines = [f"rig {rig.name}: {rig.description}", ""]
     for name, radar in rig.radars.items():
         chip = radar.schedule.profile.chip
-        real = "" if chip.complex_samples else "; its real samples are not imaged"
+        real = "" if chip.complex_samples else ", real samples"
         lines.append(f"{name}: {chip.name}, {radar.schedule.slots} TX x {chip.chips * chip.rx} RX{real}")
         lines += [f"  {key:<18}{value:10.4g} {unit}" for key, (value, unit) in schedule_figures(radar.schedule).items()]
     lines += ["", format_table(rig.constraints())]

@@ -27,7 +27,7 @@ class Blocks:
         element: int64 [block of the row, rx], place in the row; -1: none.
         channel: the same, place among the row's channels.
         channel_start: int64 [slots, receivers], word of the first sample of every channel.
-        channel_step, channel_word: as ``kernels_checks.dead_channels`` takes them.
+        channel_samples, channel_step, channel_word: as ``kernels_checks.dead_channels`` takes them.
     """
 
     pairs: list[tuple[int, int]]
@@ -38,6 +38,7 @@ class Blocks:
     element: Int64
     channel: Int64
     channel_start: Int64
+    channel_samples: int
     channel_step: int
     channel_word: int
 
@@ -49,12 +50,13 @@ class Blocks:
         every = [(s, d) for d in range(layout.devices) for s in range(layout.slots)]
         row = [(s, d) for s, d in every if (element[s, d] >= 0).any()]
         beside = [pair for pair in every if pair not in row] if read_elevation else []
-        chirp = layout.samples * layout.rx
+        words = layout.samples * layout.parts // 2
+        chirp = words * layout.rx
         loop_stride = layout.slots * chirp
         interleaved = layout.kind == "cascade"
         slot, receiver = np.indices((layout.slots, layout.devices * layout.rx))
         device, rx = receiver // layout.rx, receiver % layout.rx
-        first = device * layout.loops * loop_stride + slot * chirp + rx * (1 if interleaved else layout.samples)
+        first = device * layout.loops * loop_stride + slot * chirp + rx * (1 if interleaved else words)
         channel = geometry.channels().index(layout.slots, layout.devices * layout.rx).reshape(shape)
         return cls(
             pairs=row + beside,
@@ -65,8 +67,9 @@ class Blocks:
             element=np.ascontiguousarray([element[s, d] for s, d in row], dtype=np.int64),
             channel=np.ascontiguousarray([channel[s, d] for s, d in row]),
             channel_start=np.ascontiguousarray(first, dtype=np.int64),
-            channel_step=layout.rx if interleaved else 2,
-            channel_word=1 if interleaved else 2,
+            channel_samples=words,
+            channel_step=layout.rx if interleaved else layout.parts,
+            channel_word=1 if interleaved else layout.parts,
         )
 
     def tabulate(self, values: NDArray[np.inexact], table: Float32) -> None:

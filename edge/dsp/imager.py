@@ -44,9 +44,10 @@ class Imager:
     """Loop sum, range FFT, TDM and near-field compensation, angle FFT, power of one radar.
 
     Power is LSB^2 per complex sample: a point target of amplitude a LSB in the middle of a cell gives a^2, divided by
-    the two-way antenna gain along the array. Elements of the virtual row that are missing are zeros; doubled ones are
-    averaged. The rig's motion turns the chirp at time t by 4 pi (v . d) t / lambda, which differs from direction d to
-    direction: one compensation serves while its error at the edge of the field of view stays below 0.01 rad rms over
+    the two-way antenna gain along the array. Real samples count twice, so that a cos(...) gives a^2 too, and the half
+    of their spectrum with positive frequencies is kept. Missing elements of the virtual row are zeros, doubled ones
+    are averaged. The rig's motion turns the chirp at time t by 4 pi (v . d) t / lambda, which differs from direction
+    to direction: one compensation serves while its error at the edge of the field of view stays below 0.01 rad rms over
     the row, beyond that the transmitters' positions are corrected (edge/dsp/steering.py). What becomes of the loops is
     chosen frame by frame; ``last_report`` says what and why.
 
@@ -61,9 +62,11 @@ class Imager:
     def __init__(self, radar: Radar, settings: HeatmapSettings, antenna: AntennaSettings) -> None:
         layout = radar.schedule.layout
         self.radar, self.settings, self.layout = radar, settings, layout
-        self.points = max(64, tables.next_power_of_two(layout.samples))
+        real = layout.kind == "dca1000_real"
+        self._length = max(128 if real else 64, tables.next_power_of_two(layout.samples))
+        self.points = self._length // 2 if real else self._length
         self.geometry = RowGeometry.of(radar)
-        require(self.points <= 1024, "profile.samples", layout.samples, "at most 1024")
+        require(self._length <= 1024, "profile.samples", layout.samples, "at most 1024")
         require(
             settings.angle_bins >= 2 * self.geometry.count,
             "heatmap.angle_bins",
@@ -86,7 +89,7 @@ class Imager:
         bins = self.settings.angle_bins
         cosine = (np.arange(bins) - bins // 2) / (bins * self.geometry.pitch)
         bin_m = SPEED_OF_LIGHT_M_S * self._profile.sample_rate_hz / (2.0 * self._profile.slope_hz_per_s_actual)
-        range_m = np.arange(self.points) * bin_m / self.points + self.radar.mounting.range_offset_m
+        range_m = np.arange(self.points) * bin_m / self._length + self.radar.mounting.range_offset_m
         self.range_m = range_m.astype(np.float32)
         self.direction_cosine = cosine.astype(np.float32)
         self._gain = (10.0 ** (0.2 * along_loss_db(antenna, cosine))).astype(np.float32)
@@ -98,7 +101,7 @@ class Imager:
         layout, calibration, geometry = self.layout, self.radar.calibration, self.geometry
         samples, rx = layout.samples, layout.rx
         taper = tables.taper(self.settings, "range", samples, samples / 2)
-        self._range_taper = taper / taper.sum()
+        self._range_taper = (2 // layout.parts) * taper / taper.sum()
         angle_taper = tables.taper(self.settings, "angle", geometry.count, (geometry.count - 1) / 2)
         weight = geometry.channel_weight(angle_taper / angle_taper.sum())
         self._rows = np.arange(self.points, dtype=np.int64) * rx
@@ -108,7 +111,7 @@ class Imager:
             baked = tables.curvature_m(calibration.reference_range_m, a, b)
             phase = -2.0 * np.pi / self._wavelength_m * (tables.curvature_m(self._focus_range_m, a, b) - baked)
         phasor = np.exp(1j * phase)
-        self._window = zeros((len(self._blocks.pairs), 2, self.points * rx))
+        self._window = zeros((len(self._blocks.pairs), 2, self._length * rx))
         self._tabulate_calibration()
         self._focus, self._phasors = (zeros((self._blocks.row, 2, self.points * rx)) for _ in range(2))
         self._blocks.tabulate(weight[..., None] * phasor, self._focus)
@@ -151,15 +154,15 @@ class Imager:
         noise = angle_taper**2 / np.where(self.geometry.multiplicity > 0, self.geometry.multiplicity, np.inf)
         slope_q = (slope * q).sum()
         self._response = PointResponse(
-            range_fit=fit_response(taper, self.points, weight[inside], p[inside] / (2.0 * bin_m)),
+            range_fit=fit_response(taper, self._length, weight[inside], p[inside] / (2.0 * bin_m)),
             angle_fit=fit_response(angle_taper, self.settings.angle_bins, np.ones(1), np.zeros(1)),
             gain=self._gain,
             range_bias_m2=float(0.25 * mean_q),
             cosine_bias_m=float(slope_q),
             focus_inverse_m=focus_inverse_m,
-            range_correlation=noise_correlation(taper**2, self.points),
+            range_correlation=noise_correlation(taper**2, self._length),
             angle_correlation=noise_correlation(noise, self.settings.angle_bins),
-            range_envelope=tables.response_envelope(taper, self.points),
+            range_envelope=tables.response_envelope(taper, self._length),
             angle_envelope=tables.defocused_envelopes(
                 *(weight, self.geometry.element, (q - mean_q - slope_q * p) / self._wavelength_m, angle_taper),
                 bins=self.settings.angle_bins,
@@ -169,19 +172,21 @@ class Imager:
         )
 
     def _make_buffers(self) -> None:
-        layout, bins, plane = self.layout, self.settings.angle_bins, self.points * self.layout.rx
-        self._range_kernel = range_kernel(layout.kind == "cascade", layout.iq_order == "QI", self.points)
+        layout, bins, plane = self.layout, self.settings.angle_bins, self._length * self.layout.rx
+        self._range_kernel = range_kernel(layout.kind, layout.iq_order == "QI", self._length)
         self._channel_kernel = channel_kernel(self.points, layout.rx)
         self._row_kernel = row_kernel(self.points)
         self._angle_kernel = angle_kernel(bins, self.points, ANGLE_LANES)
-        self._range_twiddle = aligned(tables.twiddles(self.points, -1, layout.rx))
-        self._range_order = tables.last_stage_order(self.points)
+        self._range_twiddle = aligned(tables.twiddles(self._length, -1, layout.rx))
+        self._range_order = tables.last_stage_order(self._length)
         self._angle_twiddle = tables.twiddles(bins, +1, 0)
         self._target = tables.centred_rows(bins)
         self._phasor = np.ones(layout.slots, dtype=np.complex64)
-        self._spectra, self._sums = zeros((len(self._blocks.pairs), 2 * plane)), zeros(2 * plane)
-        self._spectra_rows = self._spectra.view(np.complex128)
-        self._range_work, self._row_work = zeros(2 * plane), zeros(2 * plane)
+        self._whole, self._sums = zeros((len(self._blocks.pairs), 2 * plane)), zeros(2 * plane)
+        self._whole_rows, self._spectra = self._whole.view(np.complex128), self._whole
+        if self.points < self._length:
+            self._spectra = zeros((len(self._blocks.pairs), 2 * self.points * layout.rx))
+        self._range_work, self._row_work = zeros(2 * plane), zeros(2 * self.points * layout.rx)
         self._range_rows = self._range_work.view(np.complex128)
         self._row, self._angle_work = zeros((2, self.geometry.count, self.points)), zeros(2 * bins * ANGLE_LANES)
         self._power = zeros((bins, self.points))
@@ -204,7 +209,7 @@ class Imager:
         coherent = tdm.coherent_loops(speed_m_s, self._wavelength_m, self._loop_time_s, most)
         steerable = most
         if speed_m_s > 0.0 and coherent < most:
-            bin_m = float(self.range_m[1] - self.range_m[0]) * self.points / self.layout.samples
+            bin_m = float(self.range_m[1] - self.range_m[0]) * self._length / self.layout.samples
             in_bin = int(bin_m / (speed_m_s * self._loop_time_s))
             steerable = min(most, max(1, in_bin), self._steering.loops_that_fit(forward_m_s, along_m_s, most))
         tried, of_partner = (len(self._across.speeds_m_s(speed)) for speed in (across_m_s, along_m_s))
@@ -300,8 +305,11 @@ class Imager:
         rails = self._range_kernel(
             *(adc, loops, self._blocks.loop_stride, self._blocks.start[:blocks], self.layout.samples, self._window),
             *(self._range_twiddle, self._range_order, self._sums, self._range_work, self._range_rows),
-            *(self._spectra, self._spectra_rows),
+            *(self._whole, self._whole_rows),
         )
+        if self.points < self._length:
+            planes = len(self._whole), 2, -1
+            np.copyto(self._spectra.reshape(planes), self._whole.reshape(planes)[:, :, : self.points * self.layout.rx])
         return int(rails)
 
     def _run_loops(self, adc: NDArray[np.int32], choice: tdm.Choice) -> int:
@@ -364,9 +372,9 @@ class Imager:
         layout = self.layout
         beside = len(self._blocks.pairs) - self._blocks.row
         blocks = choice.loops * self._blocks.row + beside * (1 if choice.name in ("steer", "fft") else choice.loops)
-        share = rails / (2 * blocks * layout.samples * layout.rx)
-        channels = (self._blocks.channel_start, layout.samples, self._blocks.channel_step, self._blocks.channel_word)
-        dead = dead_channels(adc, *channels, self._dead)
+        share = rails / (layout.parts * blocks * layout.samples * layout.rx)
+        channels = (self._blocks.channel_start, self._blocks.channel_samples, self._blocks.channel_step)
+        dead = dead_channels(adc, *channels, self._blocks.channel_word, self._dead)
         names = dead_names(self._dead, self.radar.schedule.transmitters) if dead else ()
         self.last_report = FrameReport(choice.loops, share, names, choice.name, choice.reason)
 

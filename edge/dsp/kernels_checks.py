@@ -29,9 +29,9 @@ def dead_channels(adc, start, samples, step, word, dead):  # type: ignore[no-unt
     Args:
         adc: int32 [values / 2], two int16 in one word.
         start: int64 [slots, receivers], word of each channel's first sample.
-        samples: of one chirp.
-        step: words between samples (cascade: receivers of a device; DCA1000: 2 words for 2 samples).
-        word: words that make the repeated unit (cascade 1: one sample; DCA1000 2: two samples).
+        samples: words of one channel's chirp.
+        step: words between units (cascade: receivers of a device; DCA1000: 2 words for 2 samples; 1, real samples).
+        word: words that make the repeated unit (cascade 1: one sample; DCA1000 2: two samples; 1, two real samples).
         dead: uint8 [slots, receivers], set to 1 where the channel is constant.
     Returns:
         Channels that are constant.
@@ -43,7 +43,7 @@ def dead_channels(adc, start, samples, step, word, dead):  # type: ignore[no-unt
             constant = True
             for w in range(word):
                 value = adc[first + w]
-                if word == 2 and np.int16(value) != np.int16(value >> 16):
+                if word == step and np.int16(value) != np.int16(value >> 16):
                     constant = False
                 n = 0
                 while constant and n < samples // word:

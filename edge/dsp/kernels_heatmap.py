@@ -141,6 +141,21 @@ def _add_pairwise(adc, start, samples, rx, keep, acc, to_first, to_second):  # t
 
 
 @njit(inline="always")
+def _add_real(adc, start, samples, rx, keep, acc):  # type: ignore[no-untyped-def]
+    """acc = keep acc + one chirp, [rx, sample], real; returns the codes at the rails."""
+    rails, words = float32(0), samples // 2
+    for r in range(rx):
+        begin = uint64(start + r * words)
+        for h in range(words):
+            packed, x = adc[begin + uint64(h)], 2 * h * rx + r
+            a, b = float32(np.int16(packed)), float32(np.int16(packed >> 16))
+            acc[x] = acc[x] * keep + a
+            acc[x + rx] = acc[x + rx] * keep + b
+            rails += _at_rail(a) + _at_rail(b)
+    return rails
+
+
+@njit(inline="always")
 def _window(acc, window, b, work, im):  # type: ignore[no-untyped-def]
     """Multiply the sums by the block's complex window: taper, channel gain, range shift, scale."""
     for x in range(im):
@@ -174,11 +189,12 @@ def _focus(spectra, focus, b, pr, pi, points, rx, im, work):  # type: ignore[no-
 
 
 @cache
-def range_kernel(interleaved: bool, swapped: bool, points: int) -> Callable[..., Any]:
+def range_kernel(kind: str, swapped: bool, points: int) -> Callable[..., Any]:
     """Compile the kernel from raw samples to the virtual row's range spectra.
 
     Args:
-        interleaved: raw chirps are [sample, rx, 2] (cascade); else [rx, sample / 2, 4] (DCA1000).
+        kind: of the layout. Raw chirps are [sample, rx, 2] (cascade), [rx, sample / 2, 4] (dca1000) or [rx, sample]
+            (dca1000_real).
         swapped: Q comes before I.
         points: length of the FFT, a power of two, 64..1024; shorter chirps are zero-padded.
     Returns:
@@ -186,9 +202,9 @@ def range_kernel(interleaved: bool, swapped: bool, points: int) -> Callable[...,
         twiddle, order int64 (``tables.last_stage_order``), acc [2 * points * rx], work as acc, work_rows (the same as
         complex128), spectra [block, 2 * points * rx], spectra_rows (the same as complex128)) -> components at the
         rails. ``spectra`` receives each block's [(re, im), range, rx]; ``acc`` must hold zeros beyond ``samples * rx``
-        of each plane.
+        of each plane, and all over the second one for real samples.
     """
-    rx = RECEIVERS
+    rx, interleaved, real = RECEIVERS, kind == "cascade", kind == "dca1000_real"
     im, last = points * rx, 2 if points in (128, 512) else 4
     signature = int64(
         *(RAW, int64, int64, int64[::1], int64, float32[:, :, ::1], float32[::1], int64[::1], float32[::1]),
@@ -207,6 +223,8 @@ def range_kernel(interleaved: bool, swapped: bool, points: int) -> Callable[...,
                 keep = float32(loop > 0)
                 if interleaved:
                     rails += int64(_add_interleaved(adc, first, samples * rx, keep, acc, to_i, im - to_i))
+                elif real:
+                    rails += int64(_add_real(adc, first, samples, rx, keep, acc))
                 else:
                     rails += int64(_add_pairwise(adc, first, samples, rx, keep, acc, to_i, im - to_i))
             _window(acc, window, b, work, im)

@@ -6,7 +6,8 @@ CLOCK_MONOTONIC. The rig's folder and calibrations are attachments, so a recordi
 
 A raw frame is a header of 64 bytes (little endian) and the int16 samples in the capture's own order:
 ``4s magic, u16 version, u8 radar, u8 kind, u64 number, i64 t_first_chirp_ns, u16 devices, loops, slots, samples, rx,
-u16 IQ order``, zeros to 64. A pose is JSON that Foxglove shows (``foxglove.PoseInFrame``) with exact numbers.
+u16 IQ order``, zeros to 64; kind 0 cascade, 1 dca1000, 2 dca1000_real. A pose is JSON that Foxglove shows
+(``foxglove.PoseInFrame``) with exact numbers.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ POSE_JSON_SCHEMA = json.dumps(
 
 FRAME_HEADER = struct.Struct("<4sHBBQq6H28x")
 FRAME_MAGIC = b"RFCF"
-_KINDS: tuple[Literal["cascade"], Literal["dca1000"]] = ("cascade", "dca1000")
+_KINDS: tuple[Literal["cascade", "dca1000", "dca1000_real"], ...] = ("cascade", "dca1000", "dca1000_real")
 _IQ_ORDERS: tuple[Literal["IQ"], Literal["QI"]] = ("IQ", "QI")
 
 
@@ -139,7 +140,8 @@ def decode_frame(payload: memoryview) -> RadarFrame:
     samples = payload[FRAME_HEADER.size :]
     loops, slots, samples_per_chirp, rx = axes
     single_chip = devices == 1 and samples_per_chirp % 2 == 0
-    if max(radar, kind, iq_order) > 1 or not all((devices, *axes)) or (kind == 1 and not single_chip):
+    known = max(radar, iq_order) <= 1 and kind < len(_KINDS)
+    if not known or not all((devices, *axes)) or (kind >= 1 and not single_chip):
         raise RecordingError("raw frame with an impossible header", value=(radar, kind, iq_order, devices, *axes))
     layout = Layout(_KINDS[kind], devices, loops, slots, samples_per_chirp, rx, _IQ_ORDERS[iq_order])
     if len(samples) != layout.nbytes:

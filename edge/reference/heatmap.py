@@ -75,15 +75,21 @@ def focused_spectrum(
         radar, frame, settings: as for ``range_angle_power``.
         loops: the first so many.
     Returns:
-        complex128 [loop, slots, receivers, points] and float64 [slots, receivers], metres along the rig axis.
+        complex128 [loop, slots, receivers, points], of real samples the first half, doubled, and float64 [slots,
+        receivers], metres along the rig axis.
     """
     profile, samples = radar.schedule.profile, radar.schedule.layout.samples
     points = max(64, 1 << int(np.ceil(np.log2(samples))))
+    if radar.schedule.layout.kind == "dca1000_real":
+        points = max(128, points)
     spectrum = _range_spectrum(radar, frame, settings, loops, points)
+    spacing_m = SPEED_OF_LIGHT_M_S * profile.sample_rate_hz / (2.0 * profile.slope_hz_per_s_actual * points)
+    if radar.schedule.layout.kind == "dca1000_real":
+        points //= 2
+        spectrum = 2.0 * spectrum[..., :points]
     a, b = (radar.mounting.array_sign * np.asarray(offset)[..., None] for offset in radar.array.element_offsets_m())
     a, b = a[:, None], b[None, :]
     if settings.focus:
-        spacing_m = SPEED_OF_LIGHT_M_S * profile.sample_rate_hz / (2.0 * profile.slope_hz_per_s_actual * points)
         range_m = np.maximum(np.arange(points) * spacing_m + radar.mounting.range_offset_m, SHORTEST_RANGE_M)
         reference = radar.calibration.reference_range_m
         baked = 0.0 if np.isinf(reference) else np.hypot(reference, a) + np.hypot(reference, b) - 2.0 * reference

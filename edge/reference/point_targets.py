@@ -90,11 +90,13 @@ def pack(samples: Complex128, layout: Layout) -> Int16:
         samples: complex128 [loops, slots, devices * rx, samples], LSB.
         layout: axis order of the capture.
     Returns:
-        int16 array of shape ``layout.shape``.
+        int16 array of shape ``layout.shape``; of real samples the real parts.
     """
     shape = (layout.loops, layout.slots, layout.devices, layout.rx, layout.samples)
     parts = np.stack((samples.real, samples.imag), axis=-1).reshape(*shape, 2)
     codes = np.clip(np.rint(parts), -32768, 32767).astype(np.int16)
+    if layout.kind == "dca1000_real":
+        return np.ascontiguousarray(codes[:, :, 0, ..., 0])
     if layout.iq_order == "QI":
         codes = codes[..., ::-1]
     if layout.kind == "cascade":
@@ -104,8 +106,10 @@ def pack(samples: Complex128, layout: Layout) -> Int16:
 
 
 def unpack(adc: Int16, layout: Layout) -> Complex128:
-    """Complex samples [loops, slots, devices * rx, samples] of a capture: the inverse of ``pack``."""
+    """Complex samples [loops, slots, devices * rx, samples] of a capture: the inverse of ``pack``; real ones as are."""
     values = adc.astype(np.float64)
+    if layout.kind == "dca1000_real":
+        return values.astype(np.complex128)
     if layout.kind == "cascade":
         parts = values.transpose(1, 2, 0, 4, 3, 5)
     else:

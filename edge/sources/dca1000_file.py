@@ -38,9 +38,11 @@ class Dca1000File:
             raise CaptureError(f"{name}: rig {rig.name} has no such radar", value=radar, allowed=", ".join(rig.radars))
         schedule = rig.radars[radar].schedule
         self.layout: Layout = schedule.layout
-        if self.layout.kind != "dca1000":
+        if self.layout.kind == "cascade":
             raise CaptureError(
-                f"{name}: rig {rig.name} is not captured by a DCA1000", value=self.layout.kind, allowed="dca1000"
+                f"{name}: rig {rig.name} is not captured by a DCA1000",
+                value=self.layout.kind,
+                allowed="dca1000, dca1000_real",
             )
         self._t_start_ns, self._period_s, self._closed = t_start_ns, schedule.frame_period_s, False
         self._sizes = [file_size(path) for path in self.paths]

@@ -70,7 +70,7 @@ class CardSource:
         repaired: frames given with zeros in the place of lost bytes.
         restarts, rearms: how often the boards were set up anew after a fault, and started anew because of drift.
     Raises:
-        ConfigError: drivers that are not those of the rig; real samples, which have no layout.
+        ConfigError: drivers that are not those of the rig.
     """
 
     def __init__(

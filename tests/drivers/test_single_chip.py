@@ -62,15 +62,15 @@ def test_plan_is_every_byte_and_line() -> None:
     assert "USB serial number R1" in "\n".join(sent)
 
 
-@pytest.mark.parametrize(("name", "size", "waiting"), [("iwr6843_pair", 196_608, 48), ("awr2944_pair", 196_608, 48)])
+@pytest.mark.parametrize(("name", "size", "waiting"), [("iwr6843_pair", 196_608, 48), ("awr2944_pair", 262_144, 64)])
 def test_what_waits_for_the_next_frame_is_said(name: str, size: int, waiting: int) -> None:
     schedule = load_rig(name).radars["horizontal"].schedule
     timing = Timing.of(schedule)
     assert timing.waiting_bytes == timing.frame_bytes % 1456
     text = next(line for line in SingleChipDriver("horizontal", schedule, CaptureCardBoard()).plan() if "wait" in line)
     assert f"({timing.waiting_bytes} of the first frame's) wait 16.7 ms" in text
-    if name == "iwr6843_pair":
-        assert (timing.frame_bytes, timing.waiting_bytes) == (size, waiting)
+    assert (timing.frame_bytes, timing.waiting_bytes) == (size, waiting)
+    assert timing.frame_bytes == schedule.layout.nbytes
 
 
 def test_it_is_a_board() -> None:

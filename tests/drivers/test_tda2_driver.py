@@ -261,16 +261,17 @@ def test_start_before_arm(make: Make) -> None:
 
 
 def test_clumsy_wire(make: Make) -> None:
-    """Pieces, delays, doubled interrupts and NACKs of chips need no second try."""
+    """Pieces, delays, doubled interrupts, NACKs of chips and bytes before their sync words need no second try."""
     faults = Faults(seed=1)
     faults.set("split", "horizontal/control", value=5)
     faults.set("delay", "horizontal/control", share=0.01, value=0.01)
     faults.set("delay", "horizontal/irq", share=0.02, value=0.01)
     faults.set("duplicate", "horizontal/irq", share=0.1)
     faults.set("spi_nack", "horizontal/spi", times=2, skip=50)
+    faults.set("babble", "horizontal/spi", share=0.2, value=100)
     board, driver = make(faults)
     notes = configured(board, driver)
-    assert len(faults.struck) == 5
+    assert len(faults.struck) == 6
     assert min(faults.struck.values()) >= 1
     assert "horizontal radar: 2 commands repeated after NACK" in notes
     assert [opcode for opcode, _ in board.log].count(Opcode.DEVICE_RESET) == 4

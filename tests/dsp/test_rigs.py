@@ -69,7 +69,7 @@ def test_corridor_rig_sees_points_where_they_are():
 
 
 @pytest.mark.parametrize("which", ["horizontal", "vertical"])
-@pytest.mark.parametrize("name", ["awr1843_pair", "iwr6843_pair"])
+@pytest.mark.parametrize("name", ["awr1843_pair", "awr2944_pair", "iwr6843_pair"])
 def test_single_chip_sees_points_where_they_are(name, which):
     """The compensation of the antenna pattern moves the maximum of an eight-element lobe by up to a bin outwards."""
     eye = Eye(name, which)

@@ -22,7 +22,7 @@ from train.simulate.rig import VirtualRig, VirtualRigSettings
 from train.simulate.supplies import CyclicSupply, straight_poses, targets
 
 RECORDED = 6
-FRAMES = {"awr1843_pair": 60, "cascade_pair": 12}
+FRAMES = {"awr1843_pair": 60, "awr2944_pair": 60, "cascade_pair": 12}
 
 
 def recorded_frames(rig: Rig, path: Path) -> dict[RadarId, list[RadarFrame]]:

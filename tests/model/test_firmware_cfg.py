@@ -65,7 +65,7 @@ def test_origin_is_the_common_one(name):
     assert np.linalg.norm(apart) == pytest.approx(0.2 if name in CASCADES else 0.1, abs=0.01)
 
 
-@pytest.mark.parametrize("name", [n for n in CASCADES + SINGLE_CHIPS if n != "awr2944_pair"])
+@pytest.mark.parametrize("name", CASCADES + SINGLE_CHIPS)
 def test_settings_fit_the_array(name):
     """Imager and detector accept them, and the CFAR guard covers the main lobe but for its foot."""
     rig = load_rig(name)

@@ -161,14 +161,19 @@ def test_frame_of_a_single_chip():
     assert azimuth.max_speed_m_s == pytest.approx(1.5 * schedule.max_speed_m_s)
 
 
-def test_real_samples_have_half_the_range_and_no_layout():
+def test_real_samples_have_half_the_range_and_half_the_bytes():
     real = replace(D, device="AWR2944")
     schedule = Schedule(real, 16, PERIOD_S)
     assert real.max_range_m == pytest.approx(0.5 * D.max_range_m)
     assert real.range_bin_m == D.range_bin_m
     assert schedule.frame_bytes == 4 * 16 * 4 * 256 * 2
-    with pytest.raises(ConfigError, match="complex samples"):
-        _ = schedule.layout
+    assert schedule.layout.kind == "dca1000_real"
+    assert schedule.layout.nbytes == schedule.frame_bytes
+    assert schedule.layout.shape == (16, 4, 4, 256)
+    highest_hz = 0.45 * D.sample_rate_hz
+    assert real.usable_range_m == pytest.approx(highest_hz * 299_792_458.0 / (2 * real.slope_hz_per_s_actual))
+    with pytest.raises(ConfigError, match="even"):
+        _ = Schedule(replace(real, samples=255), 16, PERIOD_S).layout
 
 
 @pytest.mark.parametrize(

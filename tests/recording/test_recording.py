@@ -28,7 +28,7 @@ from edge.rig import load_rig
 from edge.sources.base import FrameSource
 
 
-@pytest.mark.parametrize("layout", [LAYOUT, BIG])
+@pytest.mark.parametrize("layout", [LAYOUT, BIG, Layout("dca1000_real", 1, 2, 4, 8, 4)])
 def test_round_trip(tmp_path: Path, layout: Layout) -> None:
     rig, items, path = small_rig(tmp_path / "rig", layout), content(12, layout), tmp_path / "a.mcap"
     with RecordingWriter(path, rig) as writer:

@@ -347,4 +347,4 @@ def test_a_whole_radar_with_its_card() -> None:
 
 def test_unknown_device() -> None:
     with pytest.raises(CaptureError, match="no demo for this device"):
-        DemoRadar("vertical", supply, lambda data, period_s: None, DemoSettings(device="AWR2944"))
+        DemoRadar("vertical", supply, lambda data, period_s: None, DemoSettings(device="AWR2243"))

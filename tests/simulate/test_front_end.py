@@ -73,6 +73,19 @@ def test_noise_has_the_stated_level_and_is_gaussian_and_white() -> None:
     assert abs(spectrum / spectrum.mean() - 1).max() < 5 / np.sqrt(8 * 192)
 
 
+def test_real_samples_are_the_real_parts_of_complex_ones() -> None:
+    """Noise of s / sqrt(2); over half the band that is what complex noise of s is over as many bins."""
+    board = load_rig("awr2944_pair").radars["horizontal"]
+    board = replace(board, schedule=replace(board.schedule, profile=replace(board.schedule.profile, samples=256)))
+    frame = Synthesizer(board).frame(EMPTY, FrontEnd(board, FrontEndSettings.ideal(25.0), 1), 0, 0)
+    assert frame.adc.shape == (16, 4, 4, 256)
+    assert frame.adc.std() == pytest.approx(25.0 / np.sqrt(2.0), rel=0.01)
+    spectrum = 2.0 * np.fft.fft(frame.adc.astype(float), axis=-1)[..., :128] / 256
+    assert np.mean(abs(spectrum) ** 2) == pytest.approx(25.0**2 / 128, rel=0.02)
+    with pytest.raises(ConfigError, match="iq_image_db"):
+        FrontEnd(board, FrontEndSettings(iq_image_db=-35.0), 1)
+
+
 def test_noise_is_independent_between_samples_channels_chirps_frames_and_boards() -> None:
     settings = FrontEndSettings.ideal(200.0)
     loops = captured(settings, loops=8)

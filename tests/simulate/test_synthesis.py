@@ -40,6 +40,13 @@ def single_chip(samples: int = 256, loops: int = 1, iq_order: Any = "QI") -> Rad
     return replace(board, schedule=schedule)
 
 
+def real_samples(loops: int = 1) -> Radar:
+    """AWR2944: beat frequencies up to half the sampling rate."""
+    board = load_rig("awr2944_pair").radars["horizontal"]
+    profile = replace(board.schedule.profile, samples=256)
+    return replace(board, schedule=replace(board.schedule, profile=profile, loops=loops, frame_period_s=0.1))
+
+
 def scene(count: int, farthest_m: float, speed_m_s: float = 0.0, images: bool = False, seed: int = 0) -> Scatterers:
     """Points in front of the radar at 3 m and more, velocities in any direction."""
     rng = np.random.default_rng(seed)
@@ -121,8 +128,9 @@ def test_a_static_scene_is_one_loop_seen_many_times() -> None:
         single_chip(loops=2),
         single_chip(iq_order="IQ"),
         single_chip(samples=182),
+        real_samples(loops=2),
     ],
-    ids=["cascade", "cascade QI", "single chip", "single chip IQ", "182 samples"],
+    ids=["cascade", "cascade QI", "single chip", "single chip IQ", "182 samples", "real samples"],
 )
 def test_codes_stand_where_the_capture_has_them(radar: Radar) -> None:
     points = scene(20, 9.0, 1.0 if radar.schedule.loops > 1 else 0.0)

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -300,11 +299,6 @@ def test_address_in_use(cascade: tuple[Rig, CyclicSupply], tmp_path: Path) -> No
         settings = VirtualRigSettings(tda2=Tda2Settings(port=taken.getsockname()[1]))
         with pytest.raises(ConfigError, match="cannot be used"):
             VirtualRig(rig, supply, tmp_path, settings=settings)
-
-
-def test_a_rig_that_cannot_be_emulated(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be emulated"):
-        VirtualRig(load_rig("awr2944_pair"), lambda radar, number: SimpleNamespace(), tmp_path)  # type: ignore[arg-type, return-value]
 
 
 def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ class DemoSettings:
     """How one emulated radar behaves.
 
     Args:
-        device: AWR1843 or IWR6843.
+        device: AWR1843, IWR6843 or AWR2944.
         link: a symbolic link that always leads to the terminal; None: none.
         pace: speed of its frames, 1: real time, 0: as fast as they are sent.
         start_s: time sensorStart takes; real boards need 1 to 3 s.
@@ -88,8 +88,9 @@ class DemoRadar:
         faults: Faults | None = None,
     ) -> None:
         self.radar, self.settings, self._faults = radar, settings or DemoSettings(), faults
-        if self.settings.device not in ("AWR1843", "IWR6843"):
-            raise CaptureError("no demo for this device", value=self.settings.device, allowed="AWR1843, IWR6843")
+        if self.settings.device not in ("AWR1843", "IWR6843", "AWR2944"):
+            known = "AWR1843, IWR6843, AWR2944"
+            raise CaptureError("no demo for this device", value=self.settings.device, allowed=known)
         device = DEVICES[self.settings.device]
         self.firmware, self.lines = DemoFirmware(device, self._begin, self._end), list[str]()
         self.next_number = self.bursts = 0
@@ -331,8 +332,9 @@ class DemoRadar:
         elif frame.adc.nbytes != configuration.frame_bytes:
             self._note(f"{configuration.frame_bytes} bytes a frame configured, {frame.adc.nbytes} came")
         else:
-            wanted = "QI" if swap else "IQ"
-            adc = frame.adc if frame.layout.iq_order == wanted else np.ascontiguousarray(frame.adc[..., [2, 3, 0, 1]])
+            wanted, complex_ = "QI" if swap else "IQ", frame.layout.kind == "dca1000"
+            as_is = not complex_ or frame.layout.iq_order == wanted
+            adc = frame.adc if as_is else np.ascontiguousarray(frame.adc[..., [2, 3, 0, 1]])
             assert configuration.frame is not None, "checked by the caller"
             self._lvds(adc_bytes(adc), 1e-3 * configuration.frame.period_ms)
 

@@ -88,15 +88,22 @@ class DemoConfiguration:
         return int(self.values.get("channelCfg", (0,))[0]).bit_count()
 
     @property
+    def sample_bytes(self) -> int:
+        """Bytes of one 16-bit sample: complex1x has two parts."""
+        return 2 if self.values.get("adcCfg", (0.0, 1.0))[1] == REAL else 4
+
+    @property
     def frame_bytes(self) -> int:
-        """Bytes of one frame of complex 16-bit samples."""
+        """Bytes of one frame of 16-bit samples."""
         if self.frame is None:
             return 0
         profile = self.profiles[self.chirps[self.frame.first][0]]
         chirps = (self.frame.last - self.frame.first + 1) * self.frame.loops
-        return 4 * chirps * self.receivers * profile.samples
+        return self.sample_bytes * chirps * self.receivers * profile.samples
 
 
+REAL = 0.0
+"""adcCfg's second number: real samples; 1: complex1x."""
 ARGUMENTS: dict[str, int] = {
     "dfeDataOutputMode": 1,
     "channelCfg": 3,
@@ -123,6 +130,8 @@ ARGUMENTS: dict[str, int] = {
     "calibData": 3,
 }
 """Configuration commands and how many numbers each takes."""
+OF_2944 = {"frameCfg": 8, "compRangeBiasAndRxChanPhase": 33}
+"""Those of the AWR2944's demo that differ: samples after the frames; gain and phase of 16 channels."""
 DIRECTIONS = ("cfarCfg", "cfarFovCfg")
 """Given twice, for range (0) and Doppler (1)."""
 FIXED = ("channelCfg", "adcCfg", "lowPower")
@@ -136,7 +145,7 @@ class DemoFirmware:
     """State behind the command line.
 
     Args:
-        device: chip, with its limits; AWR1843 or IWR6843.
+        device: chip, with its limits; AWR1843, IWR6843 or AWR2944 (real samples only).
         begin: called when frames start, with the configuration.
         end: called when they stop.
     Attributes:
@@ -152,6 +161,8 @@ class DemoFirmware:
         self.violations: list[str] = []
         self._device = device
         self._begin, self._end = begin, end
+        self._real = not device.complex_samples
+        self._arguments = ARGUMENTS | OF_2944 if self._real else ARGUMENTS
         self.reset()
 
     def reset(self) -> None:
@@ -168,13 +179,13 @@ class DemoFirmware:
         actions = {"sensorStart": self._start, "sensorStop": self._stop, "flushCfg": self._flush}
         try:
             if name == "queryDemoStatus":
-                return [f"Sensor State: {self.state:d}", "Data port baud rate: 921600", "Done"]
+                return [f"Sensor State: {self.state:d}", f"Data port baud rate: {self._data_baud}", "Done"]
             if name == "version":
                 platform = f"xWR{self._device.name[3:5]}xx"
                 return [f"{'Platform':24s}: {platform}", f"{'mmWave SDK Version':24s}: 03.05.00.04", "Done"]
             if name in actions:
                 return [*actions[name](_numbers(arguments)), "Done"]
-            if name not in ARGUMENTS:
+            if name not in self._arguments:
                 self.violations.append(f"{line}: not a command")
                 return [f"'{name}' is not recognized as a CLI command"]
             self._configure(name, _numbers(arguments))
@@ -184,13 +195,13 @@ class DemoFirmware:
         return ["Done"]
 
     def _configure(self, name: str, numbers: tuple[float, ...]) -> None:
-        if len(numbers) != ARGUMENTS[name]:
+        if len(numbers) != self._arguments[name]:
             raise CommandError("Invalid usage of the CLI command")
         if self.state == SensorState.STARTED and name in FRONT_END:
             raise CommandError("stop the sensor first")
         if self._fixed.get(name, numbers) != numbers:
             raise CommandError("cannot be changed after the first start without a reboot")
-        _CHECKS.get(name, _anything)(numbers)
+        self._check(name, numbers)
         configuration = self.configuration
         if name == "profileCfg":
             _check_profile(numbers, self._device)
@@ -203,9 +214,33 @@ class DemoFirmware:
             configuration.chirps.update(dict.fromkeys(chirps, (int(numbers[2]), int(numbers[7]))))
         elif name == "frameCfg":
             first, last, loops, frames = (int(number) for number in numbers[:4])
-            configuration.frame = DemoFrame(first, last, loops, frames, numbers[4], int(numbers[5]), numbers[6])
+            period_ms, trigger, delay_ms = numbers[-3:]
+            configuration.frame = DemoFrame(first, last, loops, frames, period_ms, int(trigger), delay_ms)
         key = f"{name} {int(numbers[1])}" if name in DIRECTIONS else name
         configuration.values[key] = numbers
+
+    @property
+    def _data_baud(self) -> int:
+        return 3_125_000 if self._real else 921_600
+
+    def _check(self, name: str, numbers: tuple[float, ...]) -> None:
+        """One command's numbers by themselves."""
+        transmitters = len(self._device.firing_order)
+        if name == "channelCfg":
+            inside = numbers[0] in range(1, 16) and numbers[1] in range(1, 1 << transmitters) and numbers[2] == 0
+            _need(inside, "rx, tx or cascading")
+        elif name == "adcCfg":
+            form = "real (2 0)" if self._real else "complex1x (2 1)"
+            _need(numbers == (2.0, REAL if self._real else 1.0), f"only 16 bit {form} is emulated")
+        elif name == "adcbufCfg":
+            _need(numbers[:2] == (-1.0, 1.0 if self._real else 0.0), "ADC buffer: subframe or format")
+            _need(numbers[2] in (0, 1) and numbers[3:] == (1.0, 1.0), "ADC buffer")
+        elif name == "chirpCfg":
+            _chirp(numbers, transmitters)
+        elif name == "frameCfg":
+            _frame((*numbers[:4], *numbers[-3:]))
+        else:
+            _CHECKS.get(name, _anything)(numbers)
 
     def _flush(self, _numbers: tuple[float, ...]) -> list[str]:
         if self.state == SensorState.STARTED:
@@ -241,7 +276,7 @@ class DemoFirmware:
     def _check_start(self) -> None:
         """The whole list, and every limit."""
         c = self.configuration
-        keys = [f"{n} {d}" for n in DIRECTIONS for d in (0, 1)] + [n for n in ARGUMENTS if n not in DIRECTIONS]
+        keys = [f"{n} {d}" for n in DIRECTIONS for d in (0, 1)] + [n for n in self._arguments if n not in DIRECTIONS]
         missing = [key for key in keys if key not in c.values]
         if missing or c.frame is None:
             raise CommandError(f"configuration is not complete: {', '.join(missing)}")
@@ -257,13 +292,16 @@ class DemoFirmware:
         ramp_us = frame.loops * sum(profile.ramp_end_us for profile in profiles)
         burst_us = frame.loops * sum(profile.chirp_us for profile in profiles)
         samples = profiles[0].samples
+        if self._real and int(c.values["frameCfg"][4]) != samples:
+            raise CommandError("samples of frameCfg and profileCfg differ")
+        chirp_bytes = c.sample_bytes * samples * c.receivers
         lanes_bytes = min(profile.chirp_us for profile in profiles) * LANES * LANE_MBIT_S / 8
         limits = (
             (burst_us + 300.0 <= 1000.0 * frame.period_ms, "frame does not fit its period"),
             (ramp_us < 500.0 * frame.period_ms, "RF duty of 50 % or more"),
-            (4 * samples * c.receivers <= self._device.adc_buffer_bytes, "ADC buffer"),
+            (chirp_bytes <= self._device.adc_buffer_bytes, "ADC buffer"),
             (c.frame_bytes <= self._device.cube_bytes, "radar cube"),
-            (lanes_bytes >= -(-4 * samples * c.receivers // 256) * 256, "LVDS lanes too slow for this chirp"),
+            (lanes_bytes >= -(-chirp_bytes // 256) * 256, "LVDS lanes too slow for this chirp"),
         )
         for good, what in limits:
             if not good:
@@ -301,10 +339,10 @@ def _check_profile(numbers: tuple[float, ...], device: Device) -> None:
     _need(24 <= gain <= 52 and gain % 2 == 0, "receiver gain")
 
 
-def _chirp(numbers: tuple[float, ...]) -> None:
+def _chirp(numbers: tuple[float, ...], transmitters: int) -> None:
     first, last, profile, *_, tx = numbers
     _need(0 <= first <= last < 512, "chirps 0..511")
-    _need(profile in range(4) and tx in range(1, 8), "profile or transmitters")
+    _need(profile in range(4) and tx in range(1, 1 << transmitters), "profile or transmitters")
 
 
 def _frame(numbers: tuple[float, ...]) -> None:
@@ -317,11 +355,6 @@ def _frame(numbers: tuple[float, ...]) -> None:
 
 _CHECKS: dict[str, Callable[[tuple[float, ...]], None]] = {
     "dfeDataOutputMode": lambda n: _need(n[0] == 1, "only frames (1) are emulated"),
-    "channelCfg": lambda n: _need(n[0] in range(1, 16) and n[1] in range(1, 8) and n[2] == 0, "rx, tx or cascading"),
-    "adcCfg": lambda n: _need(n == (2.0, 1.0), "only 16 bit complex1x (2 1) is emulated"),
-    "adcbufCfg": lambda n: _need(n[:2] == (-1.0, 0.0) and n[2] in (0, 1) and n[3:] == (1.0, 1.0), "ADC buffer"),
-    "chirpCfg": _chirp,
-    "frameCfg": _frame,
     "cfarCfg": lambda n: _need(n[1] in (0, 1), "range (0) or Doppler (1)"),
     "cfarFovCfg": lambda n: _need(n[1] in (0, 1), "range (0) or Doppler (1)"),
     "lvdsStreamCfg": lambda n: _need(n[0] == -1 and n[1] in (0, 1) and n[2] in (0, 1, 4) and n[3] in (0, 1), "LVDS"),

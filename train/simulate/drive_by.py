@@ -76,7 +76,7 @@ class DriveBy:
         self._start_m = np.array([middle_m, 0.0, track.height_m]) - middle_m * _direction(track.heading_deg)
         self._synthesizers = synthesizers or {radar: Synthesizer(board) for radar, board in rig.radars.items()}
         profile = next(iter(schedules.values())).profile
-        link = replace(settings.link, bandwidth_hz=float(profile.sample_rate_hz))
+        link = replace(settings.link, bandwidth_hz=float(profile.highest_beat_hz))
         self._optics = SceneOptics(
             *(self.placed, settings.optics, link, settings.antenna, float(profile.wavelength_m)),
             *(settings.front_end.noise_lsb, np.random.default_rng((seed, 1))),

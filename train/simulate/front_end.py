@@ -40,7 +40,10 @@ _LOW = 0xFFFFFFFF
 
 @dataclass(frozen=True, slots=True)
 class FrontEndSettings:
-    """One board's faults. Amplitudes are of complex samples, in LSB.
+    """One board's faults. Amplitudes are of complex samples, in LSB; a board with real samples gives their real parts.
+
+    Real noise of noise_lsb / sqrt(2) over half the sampling rate is, per range bin, what complex noise of noise_lsb is
+    over as many bins.
 
     Args:
         noise_lsb: standard deviation of a complex sample's noise behind a receiver of mean gain; 0 to 1000.
@@ -138,7 +141,8 @@ class FrontEnd:
         response, leakage: complex64 [chips, slots, samples * rx]: factor and addition of every sample.
         per_chirp: whether the chirps of a burst differ from each other in more than their noise.
     Raises:
-        ConfigError: a dead or stuck antenna that the board does not have, or a negative seed.
+        ConfigError: a dead or stuck antenna that the board does not have, an image of real samples, or a negative
+            seed.
     """
 
     def __init__(self, radar: Radar, settings: FrontEndSettings, seed: int) -> None:
@@ -148,6 +152,8 @@ class FrontEnd:
         self._index = RADARS.index(radar.radar)
         self._slots, self._receivers, self._samples = layout.slots, layout.devices * layout.rx, layout.samples
         self._rx, self._chips = layout.rx, layout.devices
+        quadrature = layout.kind != "dca1000_real" or settings.iq_image_db is None
+        require(quadrature, "front_end.iq_image_db", settings.iq_image_db, "None: real samples have no image")
         for name, known in (
             ("dead_transmitters", set(radar.schedule.transmitters)),
             ("dead_receivers", set(range(self._receivers))),

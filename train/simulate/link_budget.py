@@ -25,7 +25,7 @@ class LinkSettings:
         gain_dbi: of either antenna on boresight, 0 to 30.
         noise_figure_db: of the receiver, 0 to 30.
         temperature_k: of the noise, 200 to 400.
-        bandwidth_hz: of one complex sample, the sampling rate, 1 to 40 MHz.
+        bandwidth_hz: of one complex sample, the sampling rate (half of it with real samples), 1 to 40 MHz.
     Raises:
         ConfigError: a value out of its range.
     """

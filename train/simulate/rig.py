@@ -107,7 +107,7 @@ class VirtualRig:
         pose_stream: None: the rig has no pose sensor.
         control: control socket.
     Raises:
-        ConfigError: a radar that cannot be emulated.
+        ConfigError: an address that cannot be used.
     """
 
     def __init__(
@@ -121,9 +121,6 @@ class VirtualRig:
     ) -> None:
         self.rig, self.settings, self.root = rig, settings or VirtualRigSettings(), root
         self.faults = Faults() if faults is None else faults
-        for radar, board in rig.radars.items():
-            if board.schedule.profile.device not in ("AWR2243", "AWR1843", "IWR6843"):
-                raise ConfigError(f"{radar} radar cannot be emulated", value=board.schedule.profile.device)
         s = self.settings
         self._supply = PreparedSupply(supply, s.depth)
         self._clock = SceneClock(rig, s.pace)

@@ -302,8 +302,11 @@ def _lane_factors(shape: float, width: int) -> NDArray[np.float32]:
 
 
 def _reorder(codes: Int16, layout: Layout, adc: Int16) -> None:
-    """Codes [chips, loops, slots, samples * rx * 2], I first, into the capture's own order."""
+    """Codes [chips, loops, slots, samples * rx * 2], I first, into the capture's own order; a real mixer has I only."""
     parts = codes.reshape(*codes.shape[:3], layout.samples, RX, 2)
+    if layout.kind == "dca1000_real":
+        adc[:] = parts[0, ..., 0].transpose(0, 1, 3, 2)
+        return
     parts = parts[..., ::-1] if layout.iq_order == "QI" else parts
     if layout.kind == "cascade":
         adc[:] = parts
