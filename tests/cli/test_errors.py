@@ -52,7 +52,7 @@ REFUSED = [
     (("replay", "{rec}", "--calibration", "x.npz"), 5, "horizontal=PATH or vertical=PATH"),
     (("replay", "{rec}", "--calibration", "vertical={tmp}/text.mcap"), 5, "not a calibration"),
     (("replay", "{rec}", "--endpoint", "nonsense"), 5, "tcp://127.0.0.1:PORT"),
-    (("replay", "{rec}", "--endpoint", "tcp://0.0.0.0:5600"), 5, "not encrypted"),
+    (("replay", "{rec}", "--endpoint", "tcp://0.0.0.0:5600"), 5, "only with keys"),
     (("replay", "{rec}", "--endpoint", "ipc://{tmp}/no/folder"), 5, "cannot be bound"),
     (("replay", "{rec}", "--endpoint", "ipc://{tmp}/text.mcap"), 5, "would delete the file"),
     (("replay", "{rec}", "--endpoint", "tcp://127.0.0.1:{port}"), 5, "stop the other publisher"),
