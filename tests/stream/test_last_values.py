@@ -125,14 +125,13 @@ def test_conflated_reader_gets_the_newest_of_each_topic_however_long_it_sleeps()
         assert {type(m).__name__ for m in served(sender, client, 2)} == {"PoseMessage", "HeatmapMessage"}
         frames = [sender.pose(pose()) for _ in range(50)]
         assert len(frames) == 50
-        newest = 0
-        while newest < 50:
-            message = client.recv(WAIT_S)
-            assert message is not None
+        newest, deadline = 0, time.monotonic() + WAIT_S
+        while newest < 50 and time.monotonic() < deadline:  # a full queue may have lost the newest: the next one comes
+            message = client.recv(0.2)
             newest = message.header.sequence if isinstance(message, PoseMessage) else newest
             if newest < 50:
                 sender.pose(pose())
-                newest = max(newest, 0)
+        assert newest >= 50
         assert client.lost == {}
         assert client.skipped > 0
 
