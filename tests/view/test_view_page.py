@@ -165,7 +165,7 @@ def test_shapes_change_their_colour_with_the_switch(page: Page) -> None:
 def test_a_scripted_publisher_fills_the_page_and_a_new_start_empties_it(page: Page) -> None:
     sender, scene = Raw(), Scene()
     end_s = time.monotonic() + WAIT_S
-    sent = iter([(draft, bytes(16)) for draft in drive(0.5)] + [(pose_draft(0.1), b"another boot id.")])
+    sent, restart = iter([(draft, bytes(16)) for draft in drive(0.5)]), iter([(pose_draft(0.1), b"another boot id.")])
     counts: dict[str, int] = {}
     objects = 0
 
@@ -175,7 +175,7 @@ def test_a_scripted_publisher_fills_the_page_and_a_new_start_empties_it(page: Pa
         if scene.health.heard_s is None:
             sender.heartbeat()
             return time.monotonic() > end_s
-        for draft, boot in itertools.islice(sent, 20):
+        for draft, boot in [*itertools.islice(sent, 20), *(restart if objects == 3 else ())]:
             number = counts[draft.topic] = counts.get(draft.topic, -1) + 1
             sender.send(pack(draft, Stamp(boot, number, draft.t_ns, 0, True, "sim", bytes(8), bytes(8))))
         return scene.counts.resets >= 2 or time.monotonic() > end_s
