@@ -132,7 +132,10 @@ def _measure(options: argparse.Namespace, checkpoint: Checkpoint, network: Compl
 
 def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) -> dict[str, Any]:
     metrics = ("cd_cm", "accuracy_cm", "completeness_cm", "emd_cm", "f_5cm", "f_10cm", "f_1pct", "class_right")
-    settings = checkpoint.settings
+    settings = dict(checkpoint.settings)
+    for name in ("start", "teacher"):  # where it lay is nobody's business, which one it was is
+        if settings.get(name):
+            settings[name] = f"{Path(settings[name]).parent.name}/{Path(settings[name]).name}"
     share = settings.get("data", {}).get("simulated_share", 0.0)
     drive_bys = f"; {100 * share:.0f} % simulated drive-bys as the pipeline saw them" if share else ""
     return {
