@@ -113,7 +113,7 @@ def _measure(options: argparse.Namespace, checkpoint: Checkpoint, network: Compl
     sets = _sets(options, network, "val")
     gates = [evaluate(models, data, options.samples, 0, threads=options.threads) for data in sets]
     default = SMALL if all(int8_is_good(gate, FULL, SMALL) for gate in gates) else FULL
-    settings = DatasetSettings.default(box_frame=network.frame == "box")
+    settings = DatasetSettings.default(box_frame=network.frame == "box", neighbour_probability=0.0)
     bank = Bank(CompletionDataset("train", settings, 1), options.bank) if options.bank else None
     test = _sets(options, network, "test")[0]
     scores = evaluate(models, test, options.samples, options.emd_samples, bank, options.threads)

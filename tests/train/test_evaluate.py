@@ -19,7 +19,14 @@ from train.held_out import Case, HeldOut
 from train.network import Completion, CompletionModel, Frame
 from train.predictors import Answer, EdgePredictor, TorchPredictor
 
-DATA = DatasetSettings(truth_points=2048, max_points=300, epoch_samples=64, parametric_objects=2, evaluation_views=1)
+DATA = DatasetSettings(
+    truth_points=2048,
+    max_points=300,
+    epoch_samples=64,
+    parametric_objects=2,
+    evaluation_views=1,
+    neighbour_probability=0.0,
+)
 
 
 @pytest.fixture(scope="module")
