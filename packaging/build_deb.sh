@@ -28,7 +28,7 @@ version=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$top/pyproject.toml" | head -n 1
 architecture=$(dpkg --print-architecture)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
-root=$work/root home=$work/root/opt/rfconstruct
+root=$work/tree home=$work/tree/opt/rfconstruct
 mkdir -p "$root/DEBIAN" "$home/bin" "$root/usr/bin"
 
 put() { # put MODE SOURCE TARGET

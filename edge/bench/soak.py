@@ -142,32 +142,39 @@ def soak(
         began_s = time.monotonic()
         serve(paced(drive, 1.0, stopped), road, observer, watch)
         ran_s = time.monotonic() - began_s
-    accounts = {radar: ledger.snapshot() for radar, ledger in road.ledgers.items()}
-    frames_in = sum(account.frames_in for account in accounts.values())
-    dropped = sum(account.lost.get(cause, 0) for account in accounts.values() for cause in DEADLINE_CAUSES)
     figures = {
-        "seconds": ran_s,
-        "pairs a second": min(account.frames_ok for account in accounts.values()) / ran_s,
-        "unaccounted frames": float(sum(abs(account.pending) for account in accounts.values())),
-        "deadline drops, share": dropped / max(frames_in, 1),
+        **_counts(road, ran_s),
         **_latencies(times),
         **samples.figures(),
         "RSS peak, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "warm start, s": warm_s,
-        "shapes": float(sum(road.shapes.values())),
-        "shapes skipped": float(road.shapes_skipped),
-        "results not delivered": float(road.outbox.dropped + road.sink_failures),
         "load shedding, highest step": float(max(steps, default=0)),
         "passes": float(drive.passes),
     }
     return {
         "figures": figures,
-        "accounts": {radar: account.as_dict() for radar, account in accounts.items()},
+        "accounts": {radar: ledger.snapshot().as_dict() for radar, ledger in road.ledgers.items()},
         "stages": {stage: [t.count, t.p50_us, t.p99_us, t.max_us] for stage, t in times.summary().items()},
         "threads": {stage.name: stage.cpu_s / ran_s for stage in road.stages},
         "reasons": sorted({reason.code for reason in observer.verdict.reasons}),
         "rss_mb": [round(rss_mb, 2) for rss_mb in samples.rss_mb],
         "load": list(os.getloadavg()),
+    }
+
+
+def _counts(road: LivePipeline, ran_s: float) -> dict[str, float]:
+    """Frames and shapes of a run that has ended."""
+    accounts = {radar: ledger.snapshot() for radar, ledger in road.ledgers.items()}
+    frames_in = sum(account.frames_in for account in accounts.values())
+    dropped = sum(account.lost.get(cause, 0) for account in accounts.values() for cause in DEADLINE_CAUSES)
+    return {
+        "seconds": ran_s,
+        "pairs a second": min(account.frames_ok for account in accounts.values()) / ran_s,
+        "unaccounted frames": float(sum(abs(account.pending) for account in accounts.values())),
+        "deadline drops, share": dropped / max(frames_in, 1),
+        "shapes": float(sum(road.shapes.values())),
+        "shapes skipped": float(road.shapes_skipped),
+        "results not delivered": float(road.outbox.dropped + road.sink_failures),
     }
 
 

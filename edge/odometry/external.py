@@ -22,7 +22,8 @@ from edge.odometry.host_clock import offset_to_monotonic, tai_is_set, utc_synchr
 from edge.odometry.source import NS_PER_S, EventKind, Meter, Placement, PoseEvent, PoseHealth
 from edge.stream.decode import decode
 from edge.stream.messages import Header, PoseMessage
-from edge.stream.wire import MAJOR, MESSAGE_LIMIT_BYTES
+from edge.stream.subscribe import subscriber
+from edge.stream.wire import MAJOR
 
 TOPIC = f"{MAJOR}/pose/"
 HIGH_WATER_MARK = 256
@@ -245,23 +246,8 @@ def _require_clock(clock: str) -> None:
 
 
 def _subscriber(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
-    """A SUB socket with a bounded queue that notices a dead peer, by TCP, and keeps looking for it.
-
-    No ZMQ_HEARTBEAT_IVL: with a full queue it lets libzmq up to 4.3.5 abort the process (zeromq/libzmq issue 3937).
-    """
-    subscriber = context.socket(zmq.SUB)
-    for option, value in (
-        (zmq.RCVHWM, HIGH_WATER_MARK),
-        (zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES),
-        (zmq.LINGER, 0),
-        (zmq.HANDSHAKE_IVL, 2000),
-        (zmq.TCP_KEEPALIVE, 1),
-        (zmq.TCP_KEEPALIVE_IDLE, 2),
-        (zmq.TCP_KEEPALIVE_INTVL, 1),
-        (zmq.TCP_KEEPALIVE_CNT, 3),
-        (zmq.RECONNECT_IVL, 100),
-        (zmq.RECONNECT_IVL_MAX, 1000),
-    ):
-        subscriber.setsockopt(option, value)
-    subscriber.setsockopt_string(zmq.SUBSCRIBE, TOPIC)
-    return subscriber
+    """A subscriber of poses whose unread messages are nobody's when it closes."""
+    receiver = subscriber(context, HIGH_WATER_MARK)
+    receiver.setsockopt(zmq.LINGER, 0)
+    receiver.setsockopt_string(zmq.SUBSCRIBE, TOPIC)
+    return receiver

@@ -15,7 +15,8 @@ from edge.errors import ConfigError, WireError
 from edge.stream.decode import decode
 from edge.stream.keys import Certificate, read_secret
 from edge.stream.messages import Header, HeartbeatMessage, Message
-from edge.stream.wire import FLAG_REPEATED, HEARTBEAT_HZ, MAJOR, MESSAGE_LIMIT_BYTES, split_conflatable
+from edge.stream.subscribe import subscriber
+from edge.stream.wire import FLAG_REPEATED, HEARTBEAT_HZ, MAJOR, split_conflatable
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5600"
 ALIVE_PERIODS = 10
@@ -255,25 +256,8 @@ def _sub_socket(
     certificate: Certificate | None,
     conflate: bool,
 ) -> zmq.Socket[bytes]:
-    """A SUB socket with bounded queues that notices a dead peer and keeps looking for it.
-
-    A dead peer is noticed by TCP. ZMQ_HEARTBEAT_IVL must not be set here: a reader that is busy while its queue is full
-    misses the answers to its own heartbeats, reconnects, and libzmq up to 4.3.5 aborts the process when it goes on
-    reading (zeromq/libzmq issue 3937).
-    """
-    receiver = context.socket(zmq.SUB)
-    for option, value in (
-        (zmq.RCVHWM, RECEIVE_HIGH_WATER_MARK),
-        (zmq.MAXMSGSIZE, MESSAGE_LIMIT_BYTES),
-        (zmq.HANDSHAKE_IVL, 2000),
-        (zmq.TCP_KEEPALIVE, 1),
-        (zmq.TCP_KEEPALIVE_IDLE, 2),
-        (zmq.TCP_KEEPALIVE_INTVL, 1),
-        (zmq.TCP_KEEPALIVE_CNT, 3),
-        (zmq.RECONNECT_IVL, 100),
-        (zmq.RECONNECT_IVL_MAX, 1000),
-    ):
-        receiver.setsockopt(option, value)
+    """A subscriber with these prefixes, keys and, of /latest, only the newest message of each."""
+    receiver = subscriber(context, RECEIVE_HIGH_WATER_MARK)
     if conflate:
         receiver.setsockopt(zmq.CONFLATE, 1)
     if certificate is not None:
