@@ -77,6 +77,7 @@ class DatasetSettings:
             ground, as a calibration, a pose and a road that is not level bring them.
         neighbour_probability: chance, in train without box, of points of something else that stands beside the object
             and was not segmented from it (``perturb.with_neighbour``).
+        vary_clouds: simulated radar clouds are varied in train (``vary_cloud``).
         epoch_samples: samples of one training epoch, classes in turn.
         evaluation_views: samples of every val and test object, azimuth sectors in turn.
         origin_share: chance of a collected, a procedural (library) and an own parametric object in train, by class;
@@ -98,6 +99,7 @@ class DatasetSettings:
     sight_sigma_deg: float = 3.0
     ground_sigma_m: float = 0.02
     neighbour_probability: float = 0.15
+    vary_clouds: bool = True
     epoch_samples: int = 20_000
     evaluation_views: int = 8
     origin_share: dict[ClassName, tuple[float, float, float]] = field(
@@ -220,7 +222,7 @@ class CompletionDataset(torch.utils.data.Dataset[Sample]):
         diagonal = float(np.linalg.norm(mesh.size_m))
         for _ in range(_ATTEMPTS):
             partial, radar_m = perturb(mesh, self._perturbation, rng, sector % AZIMUTH_SECTORS)
-            if len(partial) >= settings.min_points and _spread(partial) >= settings.min_spread * diagonal:
+            if len(partial) >= settings.min_points and spread(partial) >= settings.min_spread * diagonal:
                 break
         else:
             raise MeshError(
@@ -283,7 +285,7 @@ def size_of(mesh: Mesh) -> tuple[float, float, float]:
     return x_m, y_m, z_m
 
 
-def _spread(points: Float32) -> float:
+def spread(points: Float32) -> float:
     """Standard deviation of points [n, 3] about their mean, all axes together, metres."""
     return float(np.sqrt(points.var(axis=0).sum()))
 

@@ -7,20 +7,23 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.completion.sight import bearing_rad
 from edge.config import require
 from edge.errors import RecordingError
-from train.dataset import CompletionDataset, DatasetSettings, Sample, size_of
+from train.dataset import CompletionDataset, DatasetSettings, Sample, spread
 from train.objects.library import SPLITS, Split
 from train.objects.mesh import CLASSES, Mesh, MeshError
 from train.objects.reference import HUMAN_FILE, ObjectRef
 from train.objects.sampling import sample_surface
 from train.simulate.shards import Cloud, read_clouds
+from train.vary_cloud import hidden, stretch, window, with_strays
 
 USABLE = ("whole", "split")
 """Clouds that are the object's: not merged with something else, not missing."""
 THIN_SHARE, MIRROR_SHARE = 0.5, 0.5
+WINDOW_SHARE, HIDDEN_SHARE, STRETCH_SHARE, STRAY_SHARE = 0.3, 0.3, 0.5, 0.2
 _SIZE_TOLERANCE_M = 2e-3
 _OWN = 1
 """Sets the generator of a simulated sample apart from that of the perturbed one with the same index."""
@@ -30,9 +33,10 @@ class SimulatedDataset(CompletionDataset):
     """In train, ``CompletionDataset`` with a share of simulated clouds; in val and test, simulated clouds only.
 
     Item ``index`` is a pure function of (split, seed, epoch, index, settings, share, set of clouds). The frame and its
-    errors are those of ``CompletionDataset``. In train a cloud is thinned half of the time (log-uniform, down to
-    ``min_points``) and mirrored half of the time; val and test take every cloud once, as it is. Samples that are not
-    simulated are the very ones that ``CompletionDataset`` gives for this index.
+    errors are those of ``CompletionDataset``. In train a cloud is varied (``vary_cloud``: shorter window, hidden part,
+    stretched with its truth, stray points), thinned half of the time (log-uniform, down to ``min_points``) and mirrored
+    half of the time; val and test take every cloud once, as it is. Samples that are not simulated are the very ones
+    that ``CompletionDataset`` gives for this index.
 
     Args:
         source: folder of a data set, or file of clouds.
@@ -71,7 +75,7 @@ class SimulatedDataset(CompletionDataset):
     def description(self) -> dict[str, object]:
         """What decides the samples beside seed and settings."""
         data = {"simulated_set": self.identity, "simulated_share": self.share, "simulated_clouds": len(self.clouds)}
-        return super().description | data
+        return super().description | data | {"simulated_variation": self.settings.vary_clouds}
 
     @property
     def summary(self) -> str:
@@ -96,24 +100,47 @@ class SimulatedDataset(CompletionDataset):
         """A cloud and its truth."""
         settings = self.settings
         mesh = self._checked_mesh(cloud.object)
-        count = most = min(len(cloud), settings.max_points)
-        if self.split == "train" and rng.random() < THIN_SHARE:
-            count = round(np.exp(rng.uniform(np.log(min(settings.min_points, most)), np.log(most))))
-        chosen = rng.permutation(len(cloud))[:count]
+        vary = self.split == "train" and settings.vary_clouds
+        chosen = self._chosen(cloud, float(np.linalg.norm(mesh.size_m)), rng)
         partial, power_db = cloud.xyz_m[chosen], cloud.power_db[chosen] - np.median(cloud.power_db)
         truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
         rotation, translation = cloud.rotation.astype(np.float32), cloud.translation_m.astype(np.float32)
+        scale = stretch(rng) if vary and rng.random() < STRETCH_SHARE else np.ones(3, np.float32)
+        partial, truth = ((partial - translation) @ rotation * scale) @ rotation.T + translation, truth * scale
+        if vary and rng.random() < STRAY_SHARE:
+            partial = with_strays(partial, settings.max_points, rng)
         if settings.box_frame:
             partial = np.asarray((partial - translation) @ rotation, np.float32)
         else:
             truth = truth @ rotation.T + translation
             partial, truth = self._as_seen(partial, truth, bearing_rad(cloud.object, cloud.sensor_m, partial), rng)
-            power_db = np.pad(power_db, (0, len(partial) - len(power_db)))  # a neighbour's power is not known
+        power_db = np.pad(power_db, (0, len(partial) - len(power_db)))  # that of neighbours and strays is not known
         if self.split == "train" and rng.random() < MIRROR_SHARE:
             mirror = np.array([1, -1, 1], np.float32)
             partial, truth = partial * mirror, truth * mirror
         partial, truth = np.ascontiguousarray(partial), np.ascontiguousarray(truth)
-        return Sample(partial, truth, mesh.label, cloud.object, size_of(mesh), power_db.astype(np.float32))
+        x_m, y_m, z_m = (float(v) for v in mesh.size_m * scale)
+        return Sample(partial, truth, mesh.label, cloud.object, (x_m, y_m, z_m), power_db.astype(np.float32))
+
+    def _chosen(self, cloud: Cloud, diagonal_m: float, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Indices of the cloud's points that are taken, in random order: all of them, in train often fewer."""
+        settings, kept = self.settings, np.arange(len(cloud))
+        if self.split == "train" and settings.vary_clouds:
+            if rng.random() < WINDOW_SHARE:
+                kept = self._if_enough(cloud, kept, kept[window(cloud.frame_number, cloud.frames, rng)], diagonal_m)
+            if rng.random() < HIDDEN_SHARE:
+                kept = self._if_enough(cloud, kept, kept[~hidden(cloud.xyz_m[kept], rng)], diagonal_m)
+        count = most = min(len(kept), settings.max_points)
+        if self.split == "train" and rng.random() < THIN_SHARE:
+            count = round(np.exp(rng.uniform(np.log(min(settings.min_points, most)), np.log(most))))
+        return rng.permutation(kept)[:count]
+
+    def _if_enough(
+        self, cloud: Cloud, before: NDArray[np.int64], after: NDArray[np.int64], diagonal_m: float
+    ) -> NDArray[np.int64]:
+        """``after`` where it has points enough and they are spread as the settings ask, else ``before``."""
+        enough = len(after) >= self.settings.min_points
+        return after if enough and spread(cloud.xyz_m[after]) >= self.settings.min_spread * diagonal_m else before
 
     def _checked_mesh(self, name: str) -> Mesh:
         mesh = _mesh(name, self.settings.objects_dir)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated radar clouds varied in training, so that a few thousand drive-bys are not learned by heart.
+
+A drive-by costs a second and more to simulate, a training sample 30 ms: every cloud is seen many times. What may differ
+from one look to the next without asking the simulator again: how long the window was, what stood before the object, how
+large the object is, and which stray points came along. All functions are pure; metres, z up, ground z = 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.frames import Float32
+
+__all__ = ["STRETCH_SIGMA", "hidden", "stretch", "window", "with_strays"]
+
+LEAST_FRAMES = 12
+HIDDEN_RADIUS_SHARE = (0.1, 0.35)
+STRETCH_SIGMA = (0.06, 0.04, 0.05)
+"""Along, across and up; those of the scans of cars (``objects.deform``)."""
+STRAY_SHARE = (0.005, 0.1)
+_MARGIN_M = 0.5
+_GROUND_SIGMA_M = 0.1
+
+
+def window(frame_number: NDArray[np.int64], frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Points of a shorter window: frames in a row, log-uniform in number, anywhere in the long one.
+
+    Args:
+        frame_number: int64 [n], from 0. frames: of the whole window, >= 1.
+    Returns:
+        bool [n]: seen in the short window.
+    """
+    least = min(LEAST_FRAMES, frames)
+    count = round(math.exp(rng.uniform(math.log(least), math.log(frames))))
+    first = int(rng.integers(frames - count + 1))
+    return np.asarray((frame_number >= first) & (frame_number < first + count))
+
+
+def hidden(points: Float32, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Points that something between radar and object hides: those in a ball about one of them.
+
+    Args:
+        points: float32 [n, 3], n >= 1.
+    Returns:
+        bool [n]: true where a point is hidden. The radius is a share ``HIDDEN_RADIUS_SHARE`` of the cloud's diagonal.
+    """
+    middle = points[rng.integers(len(points))]
+    diagonal_m = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    radius_m = diagonal_m * rng.uniform(*HIDDEN_RADIUS_SHARE)
+    return np.asarray(((points - middle) ** 2).sum(axis=1) < radius_m**2)
+
+
+def stretch(rng: np.random.Generator) -> Float32:
+    """An object of another size: factors along its own x, y and z.
+
+    Returns:
+        float32 [3]; the standard deviation of their logarithms is ``STRETCH_SIGMA``.
+    """
+    return np.asarray(np.exp(rng.normal(0, STRETCH_SIGMA)), np.float32)
+
+
+def with_strays(cloud: Float32, most: int, rng: np.random.Generator) -> Float32:
+    """The cloud and, after its points, stray ones: anywhere around it, and images of its own below the ground.
+
+    Args:
+        cloud: float32 [n, 3]. most: points of the result at most.
+    Returns:
+        float32 [n + strays, 3]; each kind is a log-uniform share ``STRAY_SHARE`` of n in half of the calls.
+    """
+    added = [cloud]
+    around, below = rng.random(2) < 0.5
+    if around:
+        low, high = cloud.min(axis=0) - _MARGIN_M, cloud.max(axis=0) + _MARGIN_M
+        low[2] = max(low[2], 0.0)
+        added.append(rng.uniform(low, high, (_strays(len(cloud), rng), 3)).astype(np.float32))
+    if below:
+        image = cloud[rng.integers(len(cloud), size=_strays(len(cloud), rng))].copy()
+        image[:, 2] = rng.normal(0, _GROUND_SIGMA_M, len(image)) - image[:, 2]
+        added.append(image)
+    return np.concatenate(added)[:most].astype(np.float32)
+
+
+def _strays(points: int, rng: np.random.Generator) -> int:
+    return math.ceil(points * math.exp(rng.uniform(*np.log(STRAY_SHARE))))
