@@ -105,8 +105,11 @@ class SimulatedDataset(CompletionDataset):
         partial, power_db = cloud.xyz_m[chosen], cloud.power_db[chosen] - np.median(cloud.power_db)
         truth = sample_surface(mesh.vertices, mesh.faces, settings.truth_points, rng)
         rotation, translation = cloud.rotation.astype(np.float32), cloud.translation_m.astype(np.float32)
-        scale = stretch(rng) if vary and rng.random() < STRETCH_SHARE else np.ones(3, np.float32)
-        partial, truth = ((partial - translation) @ rotation * scale) @ rotation.T + translation, truth * scale
+        scale = np.ones(3, np.float32)
+        if vary and rng.random() < STRETCH_SHARE:
+            scale = stretch(rng)
+            own = (partial - translation) @ rotation
+            partial, truth = np.asarray((own * scale) @ rotation.T + translation, np.float32), truth * scale
         if vary and rng.random() < STRAY_SHARE:
             partial = with_strays(partial, settings.max_points, rng)
         if settings.box_frame:
