@@ -58,6 +58,14 @@ def test_every_frame_is_accounted_for_and_files_are_there(tmp_path: Path, capsys
         assert reader.has_results
 
 
+def test_frames_are_made_ahead_where_the_simulator_is_slow() -> None:
+    """1200 frames of 10 ms, 20 ms each beside the pipeline: at the end of 24 s of work the clock shows 12 s."""
+    pair_s = 0.02 * street_command.BESIDE_PIPELINE
+    assert street_command.pairs_ahead(1200, pair_s, 0.01, 10_000) == 600
+    assert street_command.pairs_ahead(1200, pair_s, 0.01, 100) == 100, "memory"
+    assert street_command.pairs_ahead(1200, pair_s / 2, 0.01, 10_000) == 0, "fast enough"
+
+
 def test_a_part_of_the_drive_says_who_was_not_passed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("--pace", "0", "--out", tmp_path, "--no-publish", "--no-plot", "--seconds", "0.1")
     code = street_command.run(options(*words), SHORT)

@@ -89,6 +89,23 @@ def test_slow_supply_is_counted(rig: Rig, supply: CyclicSupply) -> None:
     source.close()
 
 
+def test_frames_made_ahead_come_first_and_the_wait_can_be_ended(rig: Rig, supply: CyclicSupply) -> None:
+    made = list[int]()
+
+    def counted(radar: RadarId, number: int) -> RadarFrame:
+        made.append(number)
+        return supply(radar, number)
+
+    source = SimulatorSource(rig, counted, frames=4, pace=1.0, depth=100)
+    source.make_ahead(lambda: False)
+    assert sorted(made) == [0, 0, 1, 1, 2, 2, 3, 3], "all of them, and nobody has asked for one"
+    assert [frame.number for frame in frames_of(list(source))] == [0, 0, 1, 1, 2, 2, 3, 3]
+    source.close()
+    endless = SimulatorSource(rig, supply, depth=10**6)
+    endless.make_ahead(lambda: True)
+    endless.close()
+
+
 def test_slow_reader_is_counted(rig: Rig, supply: CyclicSupply) -> None:
     source = SimulatorSource(rig, supply, frames=20, pace=50.0, depth=4)
     pause = threading.Event()

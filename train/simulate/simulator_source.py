@@ -13,8 +13,9 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 from edge.errors import CaptureError, RfconstructError
 from edge.frames import Pose, RadarFrame, RadarId
@@ -33,6 +34,18 @@ LATE_SHARE = 0.25
 _POLL_S = 0.1
 
 
+_Item: TypeAlias = RadarFrame | Pose | RfconstructError | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Frames and poses on their way; None after the last, an error in its place."""
+
+    ready: queue.Queue[_Item]
+    done: threading.Event
+    maker: threading.Thread
+
+
 class SimulatorSource:
     """``edge.sources.base.FrameSource`` of simulated frames.
 
@@ -42,11 +55,12 @@ class SimulatorSource:
         frames: of each radar; None: endless.
         poses: in order of time, in the time of the frames; read anew by every iteration.
         pace: 1: real time, 2: twice as fast, 0: as fast as they are read.
-        depth: items made ahead.
+        depth: items made ahead; the clock begins when so many are there (or all). May be set until iteration begins.
         first_number: of the first frame.
         rebase: times are moved to CLOCK_MONOTONIC, the first item at the start; None: when ``pace`` is 1.
         faults: channels ``<radar>/frames`` and ``pose``.
     Attributes:
+        pace, depth: as above.
         late: radar -> frames that were not ready at their instant.
         slow_reads: frames that were ready but asked for late.
     """
@@ -69,10 +83,13 @@ class SimulatorSource:
         self.late: Counter[RadarId] = Counter()
         self.slow_reads = 0
         self._rig, self._supply, self._frames, self._poses = rig, supply, frames, poses
-        self._pace, self._depth, self._first, self._faults = pace, depth, first_number, faults
+        self.depth = depth
+        self.pace = pace
+        self._first, self._faults = first_number, faults
         self._rebase = pace == 1.0 if rebase is None else rebase
         self._closed = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._line: _Line | None = None
 
     @property
     def total_frames(self) -> int | None:
@@ -85,16 +102,30 @@ class SimulatorSource:
         Raises:
             CaptureError: the supply has no such frame.
         """
-        ready: queue.Queue[RadarFrame | Pose | RfconstructError | None] = queue.Queue(self._depth)
+        line, self._line = self._line or self._begin(), None
+        try:
+            yield from self._give(line)
+        finally:
+            line.done.set()
+            join(line.maker)
+
+    def make_ahead(self, stopped: Callable[[], bool]) -> None:
+        """Make the frames of the next iteration until ``depth`` items or all are there; ends early when ``stopped``."""
+        self._line = self._line or self._begin()
+        self._fill(self._line, stopped)
+
+    def _begin(self) -> _Line:
+        ready: queue.Queue[_Item] = queue.Queue(self.depth)
         done = threading.Event()
         maker = threading.Thread(target=self._make, args=(ready, done), name="simulator", daemon=True)
         self._threads.append(maker)
         maker.start()
-        try:
-            yield from self._give(ready, maker)
-        finally:
-            done.set()
-            join(maker)
+        return _Line(ready, done, maker)
+
+    def _fill(self, line: _Line, stopped: Callable[[], bool]) -> None:
+        while not line.ready.full() and line.maker.is_alive() and not stopped():
+            if self._closed.wait(1e-3):
+                return
 
     def close(self) -> None:
         """End every iteration and the threads."""
@@ -102,11 +133,10 @@ class SimulatorSource:
         for thread in self._threads:
             join(thread)
 
-    def _give(
-        self, ready: queue.Queue[RadarFrame | Pose | RfconstructError | None], maker: threading.Thread
-    ) -> Iterator[RadarFrame | Pose | Loss]:
-        while self._pace > 0 and not ready.full() and maker.is_alive() and not self._closed.wait(1e-3):
-            pass  # the clock begins when the queue is full
+    def _give(self, line: _Line) -> Iterator[RadarFrame | Pose | Loss]:
+        ready = line.ready
+        if self.pace > 0:  # the clock begins when the queue is full
+            self._fill(line, lambda: False)
         period_s = min(radar.schedule.frame_period_s for radar in self._rig.radars.values())
         start_s, first_ns, shift_ns = time.monotonic(), None, 0
         while not self._closed.is_set():
@@ -123,19 +153,19 @@ class SimulatorSource:
             if first_ns is None:
                 first_ns, start_s = t_ns, time.monotonic()
                 shift_ns = round(start_s * 1e9) - t_ns if self._rebase else 0
-            if self._pace > 0:
-                due_s = start_s + (t_ns - first_ns) / 1e9 / self._pace
-                if isinstance(item, RadarFrame) and time.monotonic() > due_s + LATE_SHARE * period_s / self._pace:
+            if self.pace > 0:
+                due_s = start_s + (t_ns - first_ns) / 1e9 / self.pace
+                if isinstance(item, RadarFrame) and time.monotonic() > due_s + LATE_SHARE * period_s / self.pace:
                     self.late[item.radar] += starved
                     self.slow_reads += not starved
                 if not wait_until(due_s, self._closed):
                     return
             yield _moved(item, shift_ns)
 
-    def _make(self, ready: queue.Queue[RadarFrame | Pose | RfconstructError | None], done: threading.Event) -> None:
+    def _make(self, ready: queue.Queue[_Item], done: threading.Event) -> None:
         """Fill the queue until the source ends or nobody reads any more."""
 
-        def put(item: RadarFrame | Pose | RfconstructError | None) -> bool:
+        def put(item: _Item) -> bool:
             while not (done.is_set() or self._closed.is_set()):
                 try:
                     ready.put(item, timeout=_POLL_S)

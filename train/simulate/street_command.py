@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -30,6 +32,11 @@ LENGTH_M = 20.0
 """2.2 m between two road users: objects nearer to one another become one (``objects.neighbour_m``)."""
 DEPTH = 64
 """Frames and poses made ahead, half a second: a machine that does something else meanwhile costs no frame."""
+AHEAD_SHARE = 0.25
+"""Of the free memory at most for frames that are made ahead, where the simulator is slower than the radars."""
+TRIED_FRAMES = 6
+BESIDE_PIPELINE = 0.6
+"""Speed of the simulator while the pipeline runs, as a share of what it has alone (2 cores: 0.6 to 0.8)."""
 SWITCH_S = 0.0005
 """The simulator shares the interpreter with the pipeline here: stages must not wait 5 ms for it (Python's default)."""
 LAST_POSES_NS = 100_000_000
@@ -211,10 +218,30 @@ class _Drive:
 
     def _warm_up(self) -> None:
         """The simulator's kernels compile before its clock begins."""
-        start_s = time.monotonic()
-        for radar in self.street.drive.rig.radars:
-            self.street.drive.frame(radar, 0)
+        start_s, drive = time.monotonic(), self.street.drive
+        for radar in drive.rig.radars:
+            drive.frame(radar, 0)
         self.session.say(f"simulator ready after {time.monotonic() - start_s:.1f} s")
+        if self.source.pace > 0:
+            self._make_ahead()
+
+    def _make_ahead(self) -> None:
+        """As many frames before the clock begins as the simulator will be behind at the end of the drive."""
+        drive, frames = self.street.drive, (self.source.total_frames or 0) // 2
+        start_s = time.monotonic()
+        tried = range(0, frames, max(1, frames // TRIED_FRAMES))
+        for number in tried:
+            for radar in drive.rig.radars:
+                drive.frame(radar, number)
+        pair_s = (time.monotonic() - start_s) / len(tried)
+        period_s = max(radar.schedule.frame_period_s for radar in drive.rig.radars.values()) / self.source.pace
+        pair_bytes = sum(radar.schedule.frame_bytes for radar in drive.rig.radars.values())
+        ahead = pairs_ahead(frames, pair_s, period_s, int(AHEAD_SHARE * free_bytes() / pair_bytes))
+        poses_per_pair = len(drive.poses) / drive.frames
+        self.source.depth = max(DEPTH, round(ahead * (2 + poses_per_pair)))
+        pace = f"{1e3 * pair_s:.0f} ms a pair of frames"
+        self.session.say(f"simulator: {pace}, {ahead} pairs are made before the clock starts")
+        self.source.make_ahead(self.session.stopped)
 
     def _items(self) -> Iterator[RadarFrame | Pose | Loss]:
         """What the source gives; the first item, a pose, tells by how much its clock is later."""
@@ -324,6 +351,21 @@ def _program() -> str:
 def _say(options: argparse.Namespace, text: str) -> None:
     if not options.json:
         print(text, flush=True)
+
+
+def pairs_ahead(frames: int, pair_s: float, period_s: float, most: int) -> int:
+    """Pairs of frames to make before the clock starts, so that none of the drive is late.
+
+    Args:
+        frames: pairs of the drive. pair_s: time that the simulator takes for one, alone. period_s: between two of the
+            radars. most: that memory holds.
+    """
+    return min(most, math.ceil(frames * max(0.0, 1.0 - BESIDE_PIPELINE * period_s / pair_s)))
+
+
+def free_bytes() -> int:
+    """Memory that nothing uses, as the operating system counts it."""
+    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _make_folder(folder: Path) -> None:
