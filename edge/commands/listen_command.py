@@ -8,12 +8,13 @@ import itertools
 import json
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from edge.commands import arguments
+from edge.commands import arguments, subscriber
 from edge.errors import ExitCode, RfconstructError
-from edge.stream.client import DEFAULT_ENDPOINT, Client, connect
+from edge.stream.client import Client, connect
 from edge.stream.convert import save_shape
 from edge.stream.messages import (
     CloudMessage,
@@ -28,11 +29,13 @@ from edge.stream.messages import (
 
 TOPICS = ("shape", "cloud", "det", "pose", "heat", "status", "hb")
 DEFAULT_TOPICS = ("shape", "cloud", "status")
+LOOK_S = 0.5
+"""In silence it is looked so often whether the publisher refuses this client."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="address of the publisher (default: %(default)s)")
+    subscriber.add_arguments(parser)
     parser.add_argument(
         "--topic", action="append", type=topic, help=f"{', '.join(TOPICS)} (default: {', '.join(DEFAULT_TOPICS)})"
     )
@@ -51,9 +54,10 @@ def run(args: argparse.Namespace) -> int:
 
     Exit code 3 when ``--timeout`` passed without any message, or before ``--count`` of them.
     """
+    subscriber.require_keys(args.endpoint, args.keys)
     if args.save is not None:
         _make_folder(args.save)
-    with connect(args.endpoint, args.topic or DEFAULT_TOPICS, args.timeout) as client:
+    with connect(args.endpoint, args.topic or DEFAULT_TOPICS, args.timeout, keys=args.keys) as client:
         if not args.json:
             print(f"waiting for {args.endpoint}", file=sys.stderr, flush=True)
         try:
@@ -79,7 +83,7 @@ def _make_folder(folder: Path) -> None:
 
 def _print_messages(client: Client, args: argparse.Namespace) -> int:
     seen = 0
-    for message in client:
+    for message in _messages(client, args):
         content = describe(message)
         if args.json:
             print(json.dumps(content), flush=True)
@@ -92,6 +96,20 @@ def _print_messages(client: Client, args: argparse.Namespace) -> int:
         if args.count is not None and seen >= args.count:
             break
     return seen
+
+
+def _messages(client: Client, args: argparse.Namespace) -> Iterator[Message]:
+    """What comes, until silence lasts ``--timeout``; says on stderr when the publisher refuses this client."""
+    told, silent_s = False, 0.0
+    while args.timeout is None or silent_s < args.timeout:
+        wait_s = LOOK_S if args.timeout is None else min(LOOK_S, args.timeout - silent_s)
+        message = client.recv(wait_s)
+        silent_s = silent_s + wait_s if message is None else 0.0
+        if message is not None:
+            yield message
+        elif not told and (why := subscriber.why_refused(client)):
+            told = True
+            print(why, file=sys.stderr, flush=True)
 
 
 def free_path(folder: Path, message: ShapeMessage) -> Path:

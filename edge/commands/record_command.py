@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from edge.commands import arguments
+from edge.commands import arguments, subscriber
 from edge.commands.interrupts import Interrupts
 from edge.commands.listen_command import topic
 from edge.commands.record_live import LiveRecording
@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _results(args: argparse.Namespace, interrupts: Interrupts) -> int:
+    subscriber.require_keys(args.endpoint, args.keys)
     notes = [f"results of {args.endpoint}", *args.note]
     client = RecordingClient(args.endpoint, args.topics or (), keys=args.keys)
     with client:

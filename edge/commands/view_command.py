@@ -11,13 +11,13 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from edge.commands import arguments
+from edge.commands import arguments, subscriber
 from edge.commands.interrupts import Interrupts
 from edge.commands.open_source import calibrated
 from edge.errors import ConfigError, ExitCode, RecordingError
 from edge.recording.reader import RecordingReader
 from edge.rig import load_rig
-from edge.stream.client import DEFAULT_ENDPOINT, Client, connect
+from edge.stream.client import Client, connect
 from edge.view.health import STALE_S, Banner
 from edge.view.page import DEFAULT_PORT, HOST, Page
 from edge.view.playback import Player
@@ -33,7 +33,7 @@ MOST_MESSAGES = 2000
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("recording", nargs="?", type=Path, help="MCAP recording; without: a running pipeline")
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="address of the publisher (default: %(default)s)")
+    subscriber.add_arguments(parser)
     parser.add_argument("--port", type=port, default=DEFAULT_PORT, help="of the page; 0: any (default: %(default)s)")
     parser.add_argument("--host", default=HOST, help="only this machine: %(default)s; from others by an SSH tunnel")
     parser.add_argument("--rig", help="name or folder, instead of the one in the recording")
@@ -51,6 +51,8 @@ def port(text: str) -> int:
 def run(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, SIGTERM or ``--duration``."""
     check_host(args.host, args.port)
+    if args.recording is None:
+        subscriber.require_keys(args.endpoint, args.keys)
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         end_s = time.monotonic() + args.duration if args.duration else float("inf")
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             return interrupts.asked() or time.monotonic() >= end_s
 
         if args.recording is None:
-            client = stack.enter_context(connect(args.endpoint))
+            client = stack.enter_context(connect(args.endpoint, keys=args.keys))
             page = stack.enter_context(closing(Page(args.port, "RFconstruct, live")))
             _announce(page, args)
             watch_live(page, client, stopped)
@@ -129,10 +131,14 @@ def watch_live(page: Page, client: Client, stopped: Callable[[], bool], scene: S
         figures = _own_figures(scene) | {
             "messages lost on the way": str(sum(client.lost.values())),
             "malformed": str(client.malformed),
+            "refused by the publisher": str(client.refused),
             "stream": client.endpoint,
         }
         shown_s = now_s if scene.health.stopped_s is None else scene.health.stopped_s
-        page.update(scene, scene.health.banner(now_s, client.endpoint, STALE_S), figures, shown_s)
+        banner = scene.health.banner(now_s, client.endpoint, STALE_S)
+        if banner.state in ("WAITING", "STALE") and (why := subscriber.why_refused(client)):
+            banner = Banner("REFUSED", "error", why, banner.reasons)
+        page.update(scene, banner, figures, shown_s)
 
 
 def watch_recording(

@@ -12,6 +12,7 @@ from types import TracebackType
 import zmq
 
 from edge.errors import ConfigError, WireError
+from edge.stream.authenticator import HandshakeMonitor
 from edge.stream.decode import decode
 from edge.stream.keys import Certificate, read_secret
 from edge.stream.messages import Header, HeartbeatMessage, Message
@@ -25,6 +26,8 @@ LEAST_RATE = 0.9
 """Share of the nominal heartbeat rate below which the publisher counts as starved."""
 RATE_WINDOW = 21
 RECEIVE_HIGH_WATER_MARK = 64
+LONGEST_WAIT_MS = 5000
+"""A wait is cut into parts of this length, and refused handshakes are counted between them."""
 _HEARTBEAT_TOPIC = f"{MAJOR}/hb/"
 
 
@@ -70,7 +73,7 @@ class Client:
         keys: str | Path | None = None,
         conflate: bool = False,
     ) -> None:
-        self.endpoint = endpoint
+        self.endpoint, self.keys = endpoint, keys
         self.malformed = 0
         """Messages that did not follow the format and were dropped."""
         self.ignored = 0
@@ -97,12 +100,14 @@ class Client:
         wanted = [*self._topics, _HEARTBEAT_TOPIC] if topics else [""]
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._sockets: list[zmq.Socket[bytes]] = []
+        self._monitors: list[HandshakeMonitor] = []
         self._poller = zmq.Poller()
         try:
             for prefixes in [[prefix] for prefix in dict.fromkeys(wanted)] if conflate else [wanted]:
                 receiver = _sub_socket(self._context, prefixes, certificate, conflate)
                 self._sockets.append(receiver)
                 self._poller.register(receiver, zmq.POLLIN)
+                self._monitors.append(HandshakeMonitor(self._context, receiver, len(self._monitors)))
                 receiver.setsockopt(zmq.IPV6, int("[" in endpoint))
                 receiver.connect(endpoint)
         except zmq.ZMQError as error:
@@ -117,6 +122,11 @@ class Client:
     def lost(self) -> dict[str, int]:
         """Topic -> messages that are missing in its sequence; a restarted publisher loses nothing by it."""
         return dict(self._lost)
+
+    @property
+    def refused(self) -> int:
+        """Handshakes that failed: no or unknown keys, another appliance's keys, or keys where none are wanted."""
+        return sum(monitor.failures() for monitor in self._monitors)
 
     @property
     def alive(self) -> bool:
@@ -146,13 +156,21 @@ class Client:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._ready:
             left_ms = None if deadline_s is None else max(0, round(1000 * (deadline_s - time.monotonic())))
-            if self._closed or not self._poller.poll(left_ms):
+            if self._closed:
                 return None
-            self._take()
+            wait_ms = LONGEST_WAIT_MS if left_ms is None else min(left_ms, LONGEST_WAIT_MS)
+            if self._poller.poll(wait_ms):
+                self._take()
+                continue
+            _ = self.refused  # takes the reports, so that they do not pile up
+            if left_ms == wait_ms:
+                return None
         return self._ready.popleft()
 
     def close(self) -> None:
         """Disconnect; iteration ends."""
+        for monitor in self._monitors:
+            monitor.close()
         for receiver in self._sockets:
             if receiver in self._poller:
                 self._poller.unregister(receiver)

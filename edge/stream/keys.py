@@ -166,7 +166,14 @@ def read_certificate(path: Path) -> Certificate:
         with path.open("rb") as file:
             text = file.read(FILE_LIMIT_BYTES + 1).decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"keys: {path} cannot be read", value=str(error)) from error
+        absent = isinstance(error, FileNotFoundError)
+        raise ConfigError(
+            f"keys: {path} {'does not exist' if absent else 'cannot be read'}",
+            value=None if absent else getattr(error, "strerror", None) or str(error),
+            action="rfconstruct keys makes keys: init those of the appliance, client those of a subscriber"
+            if absent
+            else "read it as the user to whom it belongs",
+        ) from error
     found: dict[str, bytes] = {}
     for match in filter(None, map(_LINE.fullmatch, text.splitlines())):
         if match[1] in found:

@@ -21,7 +21,8 @@ class Banner:
     """The line at the top.
 
     Args:
-        state: WAITING (nothing came yet), STALE (it fell silent), or the appliance's own state.
+        state: WAITING (nothing came yet), STALE (it fell silent), REFUSED (the viewer is not let in), or the
+            appliance's own state.
         level: "ok", "warn" or "error".
         text: what it means.
         reasons: newest first.

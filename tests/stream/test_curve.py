@@ -225,7 +225,7 @@ def test_other_machines_need_keys_that_are_in_order(keys: KeyFolder, tmp_path: P
         publisher(settings)
     keys.clients.chmod(0o700)
     secret.unlink()
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="does not exist"):
         publisher(settings)
     with pytest.raises(ConfigError, match="number"):
         publisher(StreamSettings(("tcp://eth0:*",), key_folder=str(keys.path)))
