@@ -32,6 +32,7 @@ class IdentityKeeper:
         self._forget_ns = round(forget_s * NS_PER_S)
         self._tracks: dict[int, _Track] = {}
         self._next = 0
+        self._last_ns = 0
 
     def __len__(self) -> int:
         return len(self._tracks)
@@ -40,7 +41,9 @@ class IdentityKeeper:
         """Identities of one window's objects.
 
         One to one, the nearest pair first (global nearest neighbour by greed; equally near pairs: the older identity,
-        then the earlier object). What finds no partner gets a new identity.
+        then the earlier object). Identities of the window before come first: one that was lost takes no object from
+        one that is still followed, as when two parts of a car have become one and lose a part again. What finds no
+        partner gets a new identity.
 
         Args:
             centers_m: float64 [n, 2], on the ground plane of the odometry frame.
@@ -51,7 +54,7 @@ class IdentityKeeper:
         self._tracks = {
             identity: track for identity, track in self._tracks.items() if t_ns - track.seen_ns <= self._forget_ns
         }
-        found = self._match(centers_m)
+        found, self._last_ns = self._match(centers_m), int(t_ns)
         identities = []
         for index, center_m in enumerate(centers_m):
             identity = found.get(index)
@@ -76,7 +79,8 @@ class IdentityKeeper:
         tracked_m = np.array([track.center_m for track in self._tracks.values()])
         distance_m = np.linalg.norm(tracked_m[:, None] - centers_m[None], axis=2)
         pairs = np.argwhere(distance_m <= self._match_m)
-        order = np.argsort(distance_m[pairs[:, 0], pairs[:, 1]], kind="stable")
+        lost = np.array([track.seen_ns < self._last_ns for track in self._tracks.values()])
+        order = np.lexsort((distance_m[pairs[:, 0], pairs[:, 1]], lost[pairs[:, 0]]))
         found: dict[int, int] = {}
         taken: set[int] = set()
         for track, index in pairs[order].tolist():

@@ -259,6 +259,17 @@ def test_one_to_one_and_nearest_first() -> None:
     assert keeper.update(np.array([[0.1, 1.6]]), 2 * S)[0] not in (near, far)  # 1.6 m away from both or more
 
 
+def test_a_lost_identity_takes_no_object_from_one_that_is_followed() -> None:
+    """Front and rear of a car become one object, which then loses its rear: it stays the same object."""
+    keeper = IdentityKeeper(match_m=1.5, forget_s=5.0)
+    front, rear, whole = [4.0, 0.0], [1.0, 0.0], [2.4, 0.0]
+    rear_number, front_number = keeper.update(np.array([rear, front]), 0)
+    (whole_number,) = keeper.update(np.array([whole]), S)
+    assert whole_number == rear_number, "1.4 m away, the front 1.6 m"
+    assert keeper.update(np.array([[3.6, 0.0]]), 2 * S) == [rear_number], "the lost front is 0.4 m away, this one 1.2 m"
+    assert keeper.update(np.array([[3.6, 0.0], front]), 3 * S) == [rear_number, front_number], "it may come back"
+
+
 def test_unseen_identities_retire_and_never_return() -> None:
     keeper = IdentityKeeper(match_m=1.5, forget_s=5.0)
     spot = np.array([[3.0, 4.0]])
