@@ -6,7 +6,7 @@ from __future__ import annotations
 import resource
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from edge.errors import WireError
@@ -27,6 +27,8 @@ class PublishingSink:
 
     def __init__(self, publisher: Publisher, version: str) -> None:
         self._publisher, self._version = publisher, version
+        self.published: Callable[[Sequence[bytes]], object] | None = None
+        """Told of every message as it was sent: topic, header, payloads; it must not wait."""
         self._pipeline: Road | None = None
         self._live: Callable[[State | None], Status] | None = None
         self._start_s = time.monotonic()
@@ -106,13 +108,17 @@ class PublishingSink:
     def report(self, state: State | None = None) -> None:
         """Heartbeat and status, as far as they are due; without ``state`` that of the live pipeline, or RUN."""
         status = self._status(state or "RUN") if self._live is None else self._live(state)
-        self._publisher.heartbeat(status.state)
-        self._publisher.status(status)
+        self._sent(self._publisher.heartbeat(status.state))
+        self._sent(self._publisher.status(status))
 
-    def _send(self, send: Callable[..., object], *content: object) -> None:
+    def _sent(self, frames: Sequence[bytes]) -> None:
+        if self.published is not None:
+            self.published(frames)
+
+    def _send(self, send: Callable[..., Sequence[bytes]], *content: object) -> None:
         """Publish; what the wire format cannot express is counted."""
         try:
-            send(*content)
+            self._sent(send(*content))
         except WireError as error:
             self._unsent += 1
             if self._pipeline is not None:

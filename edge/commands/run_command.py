@@ -11,7 +11,7 @@ from collections.abc import Generator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from edge.commands import arguments, session
+from edge.commands import arguments, run_recording, session
 from edge.commands.hardware import make_boards
 from edge.commands.live_road import CardRoad, Limits, Road, SegmentRoad
 from edge.commands.open_source import calibrated
@@ -42,14 +42,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--keep", action="store_true", help="cascades: keep segments on the boards and their copies")
     parser.add_argument("--metrics", type=Path, metavar="SOCKET", help="Prometheus text by HTTP on this Unix socket")
     parser.add_argument("--metrics-port", type=arguments.count, metavar="PORT", help="the same on 127.0.0.1")
+    run_recording.add_arguments(parser)
     session.add_arguments(parser, speed=None)
 
 
 def run(args: argparse.Namespace) -> int:
     """Configure, start, play, report.
 
-    Exit code 3 when frames were lost by the hardware, bursts met, or nothing came; 4 when a board cannot be used, or
-    not any more: then what came before is processed and reported.
+    Exit code 3 when frames were lost by the hardware, bursts met, nothing came, or the recording is incomplete; 4 when
+    a board cannot be used, or not any more: then what came before is processed and reported.
     Ctrl-C and SIGTERM end the run in order: boards stopped, account printed, exit code 130 or 143.
     """
     rig = calibrated(load_rig(args.rig, args.boards), args.calibration)

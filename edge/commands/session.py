@@ -15,6 +15,7 @@ from typing import Any
 from edge.commands import arguments
 from edge.commands.interrupts import Interrupts
 from edge.commands.report import Narrator, Tally, as_dict, lines
+from edge.commands.run_recording import RunRecording
 from edge.completion.manifest import find_model
 from edge.completion.model import CompletionModel
 from edge.errors import ExitCode
@@ -103,6 +104,9 @@ class Session:
         self._publishing = None if args.no_publish else self._publisher(source_kind)
         if self._publishing is not None:
             sinks.append(self._publishing)
+        self._recording = RunRecording.of(args, rig)
+        if self._recording is not None and self._publishing is not None:
+            self._publishing.published = self._recording.published
         self.observer: Observer | None = None
         self.pipeline: Pipeline | LivePipeline
         if live:
@@ -118,16 +122,23 @@ class Session:
         publishing, versions = self._publishing, {"rfconstruct": version()}
         metrics, port = getattr(self._args, "metrics", None), getattr(self._args, "metrics_port", None)
         supervision = self._stack.enter_context(Supervision.of_environment(metrics, port))
-        if publishing is None:
-            observer = Observer(pipeline, versions, supervision.progress)
-        else:
-            counts, closed = publishing.counts, publishing.closed
-            observer = Observer(pipeline, versions, supervision.progress, counts=counts, stream_closed=closed)
+        closed = publishing.closed if publishing is not None else str
+        figures = self._recording.figures if self._recording is not None else None
+        observer = Observer(
+            pipeline, versions, supervision.progress, counts=self._counts, stream_closed=closed, recording=figures
+        )
+        if publishing is not None:
             publishing.watch(pipeline, observer.status)
             pipeline.beats.append(publishing.report)
         failures = publishing.auth_failures if publishing is not None else int
         pipeline.beats.append(lambda: supervision.show(lambda: observer.snapshot(failures())))
         return observer
+
+    def _counts(self) -> dict[str, int]:
+        """What could not be sent or recorded, by reason code."""
+        counts = self._publishing.counts() if self._publishing is not None else {}
+        dropped = self._recording.dropped() if self._recording is not None else 0
+        return counts | ({"RECORDING_DROPPED": dropped} if dropped else {})
 
     def _publisher(self, kind: Source) -> PublishingSink:
         settings = self.rig.settings.stream
@@ -167,6 +178,11 @@ class Session:
         publishing, asked = self._publishing, self._interrupts.asked
         idle = publishing.report if publishing is not None else None
         with self._stack, self._interrupts:
+            if self._recording is not None:
+                self._recording.open()
+                self._stack.callback(self._recording.close)
+                self.say(f"recording to {self._recording.path}")
+                source = self._recording.tee(source)
             try:
                 self._warm_up(prepare)
                 self._running = True
@@ -209,9 +225,13 @@ class Session:
         if self._args.json:
             pictures = self._draw()
             content = {**as_dict(self.pipeline, self.tally, pictures, self.notes), **(extra or {})}
+            if self._recording is not None:
+                content["recording"] = self._recording.as_dict()
             print(json.dumps(content, indent=2))
             return
         print("\n".join(lines(self.pipeline, self.tally, self.notes)))
+        if self._recording is not None:
+            print("\n".join(["", *self._recording.lines()]))
         for key, value in (extra or {}).items():
             name, _, unit = key.rpartition("_")
             print(f"{name.replace('_', ' ')}: {value} {unit}" if unit in ("s", "cm") else f"{key}: {value}", flush=True)
@@ -222,10 +242,11 @@ class Session:
             print(f"note: {note}")
 
     def exit_code(self, code: ExitCode) -> int:
-        """That of the signal after an interrupted run; 3 instead of 0 when pictures could not be drawn."""
+        """That of the signal after an interrupted run; 3 instead of 0 when pictures or recording are incomplete."""
         if self._interrupts.asked():
             return self._interrupts.exit_code
-        return ExitCode.DEGRADED if self._undrawn and code == ExitCode.OK else code
+        incomplete = self._undrawn or (self._recording is not None and self._recording.incomplete)
+        return ExitCode.DEGRADED if incomplete and code == ExitCode.OK else code
 
     def _draw(self) -> list[Path]:
         """Pictures that were written; whatever the drawing library refuses becomes a note."""

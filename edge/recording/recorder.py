@@ -94,8 +94,8 @@ class Recorder:
         size = SMALL_BYTES + sum(map(len, frames))
         return self._put(schema.result_topic(frames[0]), size, lambda: self._writer.published(frames, at_ns), None)
 
-    def close(self) -> None:
-        """Write what waits, for half a minute at most, and close the file.
+    def close(self, longest_s: float = CLOSE_S) -> None:
+        """Write what waits, for so long at most, and close the file.
 
         Raises:
             RecordingError: the recording ended before, or ends now, because of the disk.
@@ -103,7 +103,7 @@ class Recorder:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join(CLOSE_S)
+        self._thread.join(longest_s)
         if self._thread.is_alive():
             raise RecordingError(f"{self.path}: the disk does not answer", value=f"{self._waiting_bytes} bytes wait")
         self._writer.close()

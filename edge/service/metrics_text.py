@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from itertools import accumulate
 
-from edge.service.snapshot import Snapshot
+from edge.service.snapshot import RecordingFigures, Snapshot
 from edge.stream.messages import STATES, RadarStatus
 from edge.timing import BOUNDS_US
 
@@ -62,6 +62,8 @@ def exposition(snapshot: Snapshot) -> str:
     one("auth_failures_total", "counter", "Handshakes of subscribers that failed.", snapshot.auth_failures)
     one("shed_step", "gauge", "Step of load shedding, 0 = none.", snapshot.shed_step)
     by("queue_entries", "gauge", "Entries that wait.", "queue", snapshot.queues)
+    if snapshot.recording is not None:
+        _recording(family, snapshot.recording)
     one("resident_memory_bytes", "gauge", "Of the process.", snapshot.rss_bytes)
     one("temperature_celsius", "gauge", "Hottest sensor of the machine.", snapshot.temperature_c)
     return "\n".join(lines) + "\n"
@@ -82,6 +84,20 @@ def _radars(family: Family, radars: Mapping[str, RadarStatus]) -> None:
     ]
     family("frames_lost_total", "counter", "Frames that did not, by cause.", lost)
     family("frame_rate_hertz", "gauge", "Frames a second.", counted("fps"))
+
+
+def _recording(family: Family, figures: RecordingFigures) -> None:
+    """Messages written and dropped by topic, and whether the recording goes on."""
+
+    def counted(counts: Mapping[str, int]) -> list[Sample]:
+        return [("", {"topic": topic}, count) for topic, count in counts.items()]
+
+    going_on: list[Sample] = [("", {}, not figures.ended)]
+    family("recording", "gauge", "1 while the run is recorded, 0 when the disk ended the recording.", going_on)
+    family("recorded_total", "counter", "Messages written to the recording.", counted(figures.written))
+    family("recording_dropped_total", "counter", "Messages that the disk did not take.", counted(figures.dropped))
+    family("recorded_bytes_total", "counter", "Bytes written to the recording.", [("", {}, figures.bytes_written)])
+    family("recording_waiting_bytes", "gauge", "Bytes that wait for the disk.", [("", {}, figures.waiting_bytes)])
 
 
 def _histograms(snapshot: Snapshot) -> Iterable[Sample]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from edge.frames import RADARS
 from edge.service.live import LivePipeline
 from edge.service.machine import rss_bytes, temperature_c
-from edge.service.snapshot import Snapshot
+from edge.service.snapshot import RecordingFigures, Snapshot
 from edge.service.states import STUCK_S, Facts, StateMachine, Verdict
 from edge.stream.messages import PoseStatus, RadarStatus, State, Status
 from edge.timing import StageTime
@@ -33,6 +33,7 @@ class Observer:
         poses_from: name of the pose source.
         counts: more events since the start, code -> count, each a reason while it grows.
         stream_closed: why part of the stream is closed; empty: it is not.
+        recording: figures of the recording of the run; None: it is not recorded.
     """
 
     def __init__(
@@ -43,9 +44,11 @@ class Observer:
         poses_from: str = "source",
         counts: Callable[[], Mapping[str, int]] | None = None,
         stream_closed: Callable[[], str] = str,
+        recording: Callable[[], RecordingFigures] | None = None,
     ) -> None:
         self._pipeline, self._versions, self._watchdog = pipeline, dict(versions or {}), watchdog
         self._poses_from, self._more_counts, self._stream_closed = poses_from, counts, stream_closed
+        self._recording = recording
         self._machine, self._lock = StateMachine(), threading.Lock()
         self._born_ns = time.monotonic_ns()
         self._started_ns: int | None = None
@@ -132,6 +135,7 @@ class Observer:
             queues=self.queues(),
             rss_bytes=rss_bytes(),
             temperature_c=temperature_c(),
+            recording=self._recording() if self._recording is not None else None,
         )
 
     def queues(self) -> dict[str, int]:
@@ -162,6 +166,7 @@ class Observer:
             no_shapes=pipeline.no_shapes,
             source_error=self._source_error,
             stream_closed=self._stream_closed(),
+            recording_ended=self._recording().ended if self._recording is not None else "",
             stuck=tuple(stage.name for stage in pipeline.stages if stage.busy_s > STUCK_S),
             last_fault=pipeline.faults.last,
         )

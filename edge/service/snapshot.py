@@ -11,6 +11,24 @@ from edge.timing import Histogram
 
 
 @dataclass(frozen=True, slots=True)
+class RecordingFigures:
+    """What the recording of the run has taken so far.
+
+    Args:
+        written, dropped: topic -> messages.
+        bytes_written: of frames and messages.
+        waiting_bytes: in the queue before the disk.
+        ended: why it ended before the run; empty: it goes on.
+    """
+
+    written: Mapping[str, int] = field(default_factory=dict)
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    bytes_written: int = 0
+    waiting_bytes: int = 0
+    ended: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """Counters and gauges of one instant; counters never fall while the process lives.
 
@@ -25,6 +43,7 @@ class Snapshot:
         queues: name -> entries that wait now.
         rss_bytes: resident memory of the process.
         temperature_c: hottest sensor of the machine; None: no sensor.
+        recording: of the run; None: it is not recorded.
     """
 
     status: Status
@@ -37,3 +56,4 @@ class Snapshot:
     queues: Mapping[str, int] = field(default_factory=dict)
     rss_bytes: int = 0
     temperature_c: float | None = None
+    recording: RecordingFigures | None = None

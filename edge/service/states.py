@@ -38,6 +38,8 @@ class Code(StrEnum):
     """The source ended with an error."""
     STREAM_CLOSED = "STREAM_CLOSED"
     """Part of the stream had to be closed: the authenticator of subscribers from other machines died."""
+    RECORDING_ENDED = "RECORDING_ENDED"
+    """The disk ended the recording of the run; the run goes on."""
     STAGE_STUCK = "STAGE_STUCK"
     """A stage does not come back from one item."""
 
@@ -64,6 +66,7 @@ class Facts:
         no_shapes: why no shapes are made; empty: they are.
         source_error: why the source ended; empty: it did not.
         stream_closed: why part of the stream is closed; empty: it is not.
+        recording_ended: why the recording ended before the run; empty: it goes on, or there is none.
         stuck: names of stages that hang.
         last_fault: newest fault in words.
     """
@@ -77,6 +80,7 @@ class Facts:
     no_shapes: str = ""
     source_error: str = ""
     stream_closed: str = ""
+    recording_ended: str = ""
     stuck: tuple[str, ...] = ()
     last_fault: str = ""
 
@@ -133,6 +137,8 @@ class StateMachine:
             found[Code.SOURCE_FAILED] = facts.source_error
         if facts.stream_closed:
             found[Code.STREAM_CLOSED] = facts.stream_closed
+        if facts.recording_ended:
+            found[Code.RECORDING_ENDED] = facts.recording_ended
         if facts.stuck:
             found[Code.STAGE_STUCK] = f"no progress for {STUCK_S:g} s: {', '.join(facts.stuck)}"
         silent = {radar: age_s for radar, age_s in facts.silent_s.items() if age_s > SILENT_S}

@@ -15,7 +15,7 @@ import pytest
 from edge.cli import main
 from edge.config import StreamSettings
 from edge.service.metrics_text import exposition
-from edge.service.snapshot import Snapshot
+from edge.service.snapshot import RecordingFigures, Snapshot
 from edge.stream.messages import PoseStatus, RadarStatus, Reason, Status
 from edge.timing import StageTimes
 
@@ -47,7 +47,9 @@ def test_every_metric_has_its_line_and_every_line_its_metric() -> None:
     status = Status(
         "RUN", 0, (Reason("A", 1, 1, 1),), {"h": RadarStatus(1, 0, {"gap": 1})}, pose=PoseStatus(1, 1, 1, "x")
     )
-    text = exposition(Snapshot(status, times.histograms(), {"car": 1}, {"car": 1}, queues={"a": 1}, temperature_c=1.0))
+    one, recording = {"car": 1}, RecordingFigures({"/pose": 1}, {"/pose": 1})
+    snapshot = Snapshot(status, times.histograms(), one, one, queues={"a": 1}, temperature_c=1.0, recording=recording)
+    text = exposition(snapshot)
     given = set(re.findall(r"^# TYPE rfconstruct_(\w+)", text, re.MULTILINE))
     table = TEXT.split("| metric (`rfconstruct_…`)")[1].split("\n\n")[0]
     named = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
