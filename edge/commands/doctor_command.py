@@ -20,6 +20,7 @@ from pathlib import Path
 
 from edge import numba_cache
 from edge.commands.checks import Check, failure, lines
+from edge.commands.key_checks import keys_check
 from edge.config import CompletionSettings, StreamSettings
 from edge.errors import ExitCode, RfconstructError
 from edge.resources import data_dir
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument("--warm", action="store_true", help="compile the kernels of every shipped rig into the cache")
     parser.add_argument("--hardware", action="store_true", help="follow every link to the boards of --rig instead")
-    parser.add_argument("--rig", help="with --hardware: name or folder")
+    parser.add_argument("--rig", help="name or folder: whose keys, and with --hardware whose boards")
     parser.add_argument("--boards", type=Path, metavar="FILE", help="with --hardware: where the boards are reached")
     parser.add_argument("--quick", action="store_true", help="with --hardware: configure nothing, take no frames")
 
@@ -61,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
         cache,
         *([kernels] if args.warm else []),
         port,
+        _keys(args),
         data,
     ]
     checks: list[Check] = []
@@ -226,6 +228,15 @@ def port() -> Check:
             action = "another pipeline may be running: stop it, or publish elsewhere with --endpoint"
             return Check("port", "fails", f"{endpoint}: {error.strerror}", action)
     return Check("port", "ok", f"{endpoint} is free")
+
+
+def _keys(args: argparse.Namespace) -> Callable[[], Check]:
+    """The check of the keys of ``--rig``, or of the usual folder."""
+
+    def keys() -> Check:
+        return keys_check(load_rig(args.rig, args.boards).settings.stream if args.rig else None)
+
+    return keys
 
 
 def data() -> Check:

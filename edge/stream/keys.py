@@ -104,11 +104,31 @@ class KeyFolder:
     def problems(self) -> Iterator[str]:
         """What is wrong with files and modes, in words; nothing when all is well."""
         yield from self._folder_problems()
-        for path, secret in ((self.path / f"{SERVER}{SECRET}", True), *((p, False) for p in self._client_files())):
+        if self.path.is_dir():
+            yield from self._pair_problems()
+        for path in self._client_files():
             try:
-                read_secret(path) if secret else read_certificate(path)
+                read_certificate(path)
             except RfconstructError as error:
                 yield error.what
+
+    def _pair_problems(self) -> Iterator[str]:
+        """The secret is closed, the service's own, and of one pair with both public keys."""
+        secret_path, public_path = self.path / f"{SERVER}{SECRET}", self.path / f"{SERVER}{PUBLIC}"
+        try:
+            pair = read_secret(secret_path)
+        except RfconstructError as error:
+            yield error.what
+            return
+        if secret_path.stat().st_uid != self.path.stat().st_uid:
+            yield f"keys: {secret_path} belongs to another user than its folder (id {secret_path.stat().st_uid})"
+        if _public_of(pair.secret) != pair.public:
+            yield f"keys: secret and public key in {secret_path} are no pair"
+        try:
+            if read_certificate(public_path).public != pair.public:
+                yield f"keys: {public_path} is not the public key of {secret_path}: clients that have it are lost"
+        except RfconstructError as error:
+            yield error.what
 
     def _folder_problems(self) -> Iterator[str]:
         """Whoever may write here decides who is let in."""
@@ -201,6 +221,12 @@ def _new_pair() -> Certificate:
     import zmq  # keys are read without it
 
     return Certificate(*zmq.curve_keypair())
+
+
+def _public_of(secret: bytes) -> bytes:
+    import zmq
+
+    return bytes(zmq.curve_public(secret))
 
 
 def _make_folder(folder: Path) -> None:
