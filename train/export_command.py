@@ -57,6 +57,8 @@ def run(options: argparse.Namespace) -> int:
     from train.quantize import quantize
 
     require(options.samples >= 1, "--samples", options.samples, ">= 1")
+    if options.confidence is not None and not options.confidence.is_file():
+        raise ModelError(f"{options.confidence}: no such file", action="evaluate --fit-confidence makes it")
     checkpoint, target = load_checkpoint(options.source), options.target
     if not checkpoint.step:
         raise ModelError(f"{options.source}: not trained yet", action="train first")

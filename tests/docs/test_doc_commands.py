@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -74,6 +75,9 @@ def test_files_and_links_are_there() -> None:
         dead += [f"{page.name}: {to}" for to in links(page) if not reached(page, to)]
         files = [span for span in spans(page) if PROJECT_FILE.fullmatch(span) and "." in span]
         dead += [f"{page.name}: {file}" for file in files if not (ROOT / file).exists()]
+    for example in (ROOT / "examples").glob("*.py"):
+        told = re.findall(r"python (\S+\.py)", ast.get_docstring(ast.parse(example.read_text(encoding="utf-8"))) or "")
+        dead += [f"{example.name}: {told}"] if told != [f"examples/{example.name}"] else []
     assert not dead, "\n".join(dead)
 
 

@@ -179,6 +179,14 @@ def test_commands_name_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "none.pt" in capsys.readouterr().err
 
 
+def test_a_missing_confidence_is_refused_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = tmp_path / "no.json"
+    assert main(["export", str(tmp_path / "none.pt"), str(tmp_path), "--confidence", str(missing)]) == 6
+    assert "no.json: no such file" in capsys.readouterr().err
+
+
 def test_batch_moves_between_devices() -> None:
     batch = Batch(torch.zeros(3, 3), [1, 2], torch.zeros(2, 4, 3), torch.zeros(2, dtype=torch.int64))
     moved = batch.to(torch.device("cpu"))
