@@ -22,6 +22,7 @@ while [ $# -gt 0 ]; do
     esac
 done
 command -v dpkg-deb >/dev/null || fail "dpkg-deb is missing: apt-get install dpkg-dev"
+command -v strip >/dev/null || fail "strip is missing: apt-get install binutils"
 umask 022
 
 version=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$top/pyproject.toml" | head -n 1)
@@ -46,6 +47,24 @@ put 0644 docs/service.md /usr/share/doc/rfconstruct/service.md
 put 0644 docs/wire_format.md /usr/share/doc/rfconstruct/wire_format.md
 ln -s /opt/rfconstruct/bin/rfconstruct "$root/usr/bin/rfconstruct"
 
+# Takes out what the appliance never loads. Licences of what stays lie in *.dist-info and beside the code; they stay.
+# A package goes with its dist-info, so that nothing claims to be installed that is not.
+slim() { # slim SITE
+    find "$1" -type d -name tests -prune -exec rm -rf {} +
+    # Recordings are written uncompressed and mcap does without both; onnxruntime runs models without the other three.
+    for package in lz4 zstandard flatbuffers protobuf packaging; do rm -rf "$1/$package" "$1/$package"-*.dist-info; done
+    rm -rf "$1/google" "$1/train"
+    # A second build of the runtime for programs in C: Python's module has its own inside.
+    rm -f "$1"/onnxruntime/capi/libonnxruntime.so*
+    for part in onnxruntime/backend onnxruntime/datasets onnxruntime/quantization onnxruntime/tools \
+        onnxruntime/transformers numpy/distutils numpy/f2py numpy/_pyinstaller numpy/_core/include numpy/_core/lib; do
+        rm -rf "${1:?}/$part"
+    done
+    find "$1" -type f ! -path '*.dist-info/*' \( -name '*.pyi' -o -name '*.pxd' -o -name '*.pyx' -o -name '*.a' \
+        -o -name '*.c' -o -name '*.cpp' -o -name '*.h' -o -name '*.hpp' \) -delete
+    strip --strip-unneeded "$1/llvmlite/binding/libllvmlite.so" # 20 MB of names of its inner functions
+}
+
 python_minor=11
 if [ "$venv" = yes ]; then
     python_minor=$("$python" -c 'import sys; print(sys.version_info.minor)')
@@ -54,7 +73,7 @@ if [ "$venv" = yes ]; then
     "$python" -m venv --without-pip "$home"
     pip --python "$home/bin/python" install --no-compile --requirement "$top/requirements/edge.txt"
     pip --python "$home/bin/python" install --no-compile --no-deps "$work"/wheel/*.whl
-    find "$home/lib" -type d -name tests -prune -exec rm -rf {} +
+    slim "$home"/lib/python3.*/site-packages
     # What was built in $root will lie in /: its interpreter is the system's, its paths begin at the root.
     for link in python python3; do ln -sfn "/usr/bin/python3.$python_minor" "$home/bin/$link"; done
     rm -f "$home/bin/python3.$python_minor" "$home/bin/"[Aa]ctivate*
