@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from edge.completion.manifest import Manifest, find_model, read_files, read_mani
 from edge.completion.network import Network
 from edge.config import require
 from edge.errors import ExitCode
+from train.output import add_json, emit
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,6 +36,7 @@ def add_verb(verbs: argparse._SubParsersAction[Any]) -> None:
     verb.add_argument("--rig", default="cascade_pair", help="rig whose whole runtime is measured (%(default)s)")
     verb.add_argument("--seconds", type=float, default=60.0, help="time to spend measuring (default: %(default)s)")
     verb.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there, too")
+    add_json(verb)
     verb.set_defaults(run=run)
 
 
@@ -50,7 +53,9 @@ def run(options: argparse.Namespace) -> int:
     times = measure(_calls(manifest, read_files(folder, manifest)), options.seconds)
     resident_mb = start(options.rig, "completion").resident_mb
     text = "\n".join(_lines(manifest, times, resident_mb))
-    print(text)
+    facts = {"processor": processor(), "model": manifest.name, "default_file": manifest.default_file}
+    figures = {name: asdict(timing) for name, timing in times.items()}
+    emit(options, {**facts, "times": figures, "resident_mb": resident_mb}, [text])
     if options.markdown is not None:
         command = f"rfconstruct-train bench-completion {options.model} --seconds {options.seconds:g} "
         command += f"--markdown {options.markdown}"

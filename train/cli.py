@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 
@@ -19,6 +20,11 @@ from train.simulate.look_command import add_verbs as add_look_verbs
 from train.simulate.rig_command import add_verb as add_rig_verb
 from train.simulate.street_command import add_verb as add_street_verb
 
+EXIT_CODES = (
+    "exit codes: 0 ok, 1 failure, 2 usage, 3 degraded (something is missing from the result), 5 bad configuration, "
+    "6 bad model, 130 interrupted"
+)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns an exit code of ``edge.errors.ExitCode``."""
@@ -27,12 +33,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return int(options.run(options))
     except RfconstructError as error:
-        print(f"rfconstruct-train: {error}", file=sys.stderr)
+        if getattr(options, "json", None) is True:
+            value = None if error.value is None else str(error.value)
+            content = {"what": error.what, "value": value, "allowed": error.allowed, "action": error.action}
+            print(json.dumps({"error": content, "exit_code": int(error.exit_code)}))
+        else:
+            print(f"rfconstruct-train: {error}", file=sys.stderr)
         return int(error.exit_code)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="rfconstruct-train", description=__doc__)
+    parser = argparse.ArgumentParser(prog="rfconstruct-train", description=__doc__, epilog=EXIT_CODES)
     verbs = parser.add_subparsers(required=True, metavar="verb")
     add_fit_verb(verbs)
     add_verb(verbs)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from edge.config import require
 from edge.errors import ConfigError, ExitCode, ModelError
+from train.output import on_a_screen
 
 if TYPE_CHECKING:
     from edge.completion.confidence import ConfidenceModel
@@ -34,6 +35,7 @@ def add_verb(verbs: Any) -> None:
         help="model folder, .onnx file of a model folder, or checkpoint.pt; NAME=PATH to name it; the report is about "
         "the first",
     )
+    on_a_screen(verb, "MODEL ...")
     verb.add_argument("--split", choices=("val", "test"), default="test")
     verb.add_argument("--simulated", type=Path, help="data set of simulated drive-bys (folder or file)")
     verb.add_argument(

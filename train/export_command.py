@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from edge.config import require
 from edge.errors import ExitCode, ModelError
+from train.output import add_json, emit
 
 if TYPE_CHECKING:
     from edge.frames import Float32
@@ -45,6 +46,7 @@ def add_verb(verbs: argparse._SubParsersAction[Any]) -> None:
     verb.add_argument("--emd-samples", type=int, default=_EMD_SAMPLES, help="of these, with EMD")
     verb.add_argument("--bank", type=int, default=_BANK, help="training shapes of the baselines, 0 = no baselines")
     verb.add_argument("--threads", type=int, default=1)
+    add_json(verb)
     verb.set_defaults(run=run)
 
 
@@ -73,7 +75,8 @@ def run(options: argparse.Namespace) -> int:
         _measure(options, checkpoint, network, folder)
         for path in sorted(folder.iterdir()):
             path.replace(target / path.name)
-    print((target / "card.md").read_text())
+    manifest = json.loads((target / "manifest.json").read_text())
+    emit(options, {"folder": str(target), "manifest": manifest}, [(target / "card.md").read_text()])
     return int(ExitCode.OK)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from edge.config import require
 from edge.errors import ExitCode
+from train.output import on_a_screen
 
 if TYPE_CHECKING:
     from train.dataset import CompletionDataset, DatasetSettings
@@ -31,6 +32,7 @@ def add_verb(verbs: Any) -> None:
     fit = verbs.add_parser("fit", help="train a network, or go on with a run (see docs/training.md)")
     fit.add_argument("run_folder", type=Path, help="checkpoint.pt and log.jsonl go here")
     fit.add_argument("--resume", action="store_true", help="continue the run in the folder exactly where it stopped")
+    on_a_screen(fit, "RUN_FOLDER")
     _add_what(fit)
     fit.add_argument("--minutes", type=float, default=60.0, help="training time; a run of any length ends annealed")
     fit.add_argument("--steps", type=int, default=0, help="optimizer steps instead of minutes")

@@ -13,6 +13,7 @@ from edge.errors import ExitCode
 from train.objects.layouts import LAYOUTS, find_meshes, read_class_map, read_sizes
 from train.objects.library import SPLITS, default_objects_dir
 from train.objects.mesh import CLASSES, MeshError
+from train.output import add_json, emit
 
 
 def add_verbs(verbs: Any) -> None:
@@ -39,7 +40,10 @@ def add_verbs(verbs: Any) -> None:
     look.add_argument("--variants", type=int, default=6, help="of every training object")
     look.add_argument("--points", type=int, default=1500, help="of each cloud")
     look.set_defaults(run=_oracle)
-    inner.add_parser("time", help="CPU time of making, varying and perturbing objects").set_defaults(run=_time)
+    times = inner.add_parser("time", help="CPU time of making, varying and perturbing objects")
+    times.set_defaults(run=_time)
+    for verb in inner.choices.values():
+        add_json(verb)
 
 
 def _add_import(inner: Any) -> None:
@@ -96,7 +100,9 @@ def _import(options: argparse.Namespace) -> int:
         tell=lambda line: print(line, file=sys.stderr),
     )  # fmt: skip
     total = sum(report.written.values())
-    print(f"{total} objects ({_counts(report.written)}), {len(report.bad)} bad files skipped")
+    bad = [{"file": file, "reason": reason} for file, reason in report.bad]
+    text = f"{total} objects ({_counts(report.written)}), {len(report.bad)} bad files skipped"
+    emit(options, {"folder": str(options.target), "written": dict(report.written), "bad": bad}, [text])
     return int(ExitCode.OK)
 
 
@@ -117,12 +123,14 @@ def _lengths(items: list[str]) -> dict[Any, float]:
 def _list(options: argparse.Namespace) -> int:
     refs = _chosen(options)
     width = max(len(ref.to_text()) for ref in refs)
-    folder = options.objects
-    for ref in refs:
-        entry = ref.entry(folder)
-        print(f"{ref.to_text():{width}}  {entry.split:5}  {entry.provenance}  {entry.source_group}  {entry.licence}")
-    counts = Counter(f"{ref.class_name} {ref.entry(folder).split}" for ref in refs)
-    print(f"{len(refs)} objects: {_counts(counts)}")
+    columns = ("split", "provenance", "source_group", "licence")
+    rows = [{"object": ref.to_text(), **{c: getattr(ref.entry(options.objects), c) for c in columns}} for ref in refs]
+    counts = Counter(f"{ref.class_name} {ref.entry(options.objects).split}" for ref in refs)
+    lines = [
+        f"{row['object']:{width}}  {row['split']:5}  {row['provenance']}  {row['source_group']}  {row['licence']}"
+        for row in rows
+    ]
+    emit(options, {"objects": rows, "counts": dict(counts)}, [*lines, f"{len(refs)} objects: {_counts(counts)}"])
     return int(ExitCode.OK)
 
 
@@ -174,28 +182,29 @@ def _sheet(options: argparse.Namespace) -> int:
             sheets.setdefault(ref.class_name, []).append(mesh)
     if options.together:
         sheets = {"parametric" if options.parametric else "objects": [m for meshes in sheets.values() for m in meshes]}
-    for name, meshes in sheets.items():
-        object_sheet(meshes, options.out / f"{name}.png")
-        print(options.out / f"{name}.png")
+    files = [options.out / f"{name}.png" for name in sheets]
+    for file, meshes in zip(files, sheets.values(), strict=True):
+        object_sheet(meshes, file)
+    emit(options, {"files": [str(file) for file in files]}, map(str, files))
     return int(ExitCode.OK)
 
 
 def _oracle(options: argparse.Namespace) -> int:
     from train.objects.oracle import oracle
 
-    print(f"{'training objects':24} {'number':>7} {'median cm':>10} {'largest cm':>11}")
-    for name, count, median_m, largest_m in oracle(
-        options.class_name, options.variants, options.points, options.objects
-    ):  # fmt: skip
-        print(f"{name:24} {count:7} {100 * median_m:10.2f} {100 * largest_m:11.2f}", flush=True)
+    rows = list(oracle(options.class_name, options.variants, options.points, options.objects))
+    lines = [f"{'training objects':24} {'number':>7} {'median cm':>10} {'largest cm':>11}"]
+    lines += [f"{name:24} {count:7} {100 * mid:10.2f} {100 * largest:11.2f}" for name, count, mid, largest in rows]
+    keys = ("training_objects", "number", "median_m", "largest_m")
+    emit(options, {"class": options.class_name, "sets": [dict(zip(keys, row, strict=True)) for row in rows]}, lines)
     return int(ExitCode.OK)
 
 
 def _time(options: argparse.Namespace) -> int:
     from train.objects.timing import timings
 
-    for what, mean_ms in timings():
-        print(f"{what:36} {mean_ms:7.2f} ms", flush=True)
+    rows = dict(timings())
+    emit(options, {"mean_ms": rows}, (f"{what:36} {mean_ms:7.2f} ms" for what, mean_ms in rows.items()))
     return int(ExitCode.OK)
 
 

@@ -8,11 +8,13 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from edge.errors import ExitCode
+from train.output import add_json, emit
 
 if TYPE_CHECKING:
     from train.simulate.pool import Pool
@@ -42,31 +44,40 @@ def add_verb(verbs: Any) -> None:
     only = verb.add_mutually_exclusive_group()
     only.add_argument("--check", action="store_true", help="only read the folder, compare with its plan, show figures")
     only.add_argument("--clouds-only", type=Path, metavar="FILE", help="only pack the folder's radar clouds into FILE")
+    add_json(verb)
     verb.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """The verb; returns the exit code."""
     if options.check:
-        return _check(options.out)
+        return _check(options)
     if options.clouds_only:
-        return _pack(options.out, options.clouds_only)
+        return _pack(options, options.clouds_only)
     return _build(options)
 
 
-def _check(folder: Path) -> int:
+def _check(options: argparse.Namespace) -> int:
     from train.simulate.check import check, show
 
-    report = check(folder)
-    show(report, sys.stdout)
+    report = check(options.out)
+    if options.json:
+        faults = {"faults": report.faults, "failed": [cloud.error for cloud in report.failed]}
+        emit(options, {"folder": str(options.out), "good": report.good, "clouds": len(report.clouds), **faults}, ())
+    else:
+        show(report, sys.stdout)
     return int(ExitCode.OK if report.good else ExitCode.FAILURE)
 
 
-def _pack(folder: Path, file: Path) -> int:
+def _pack(options: argparse.Namespace, file: Path) -> int:
     from train.simulate.build import export_clouds
 
-    count = export_clouds(folder, file)
-    print(f"{file}: {count} clouds, {file.stat().st_size / 1e6:.2f} MB")
+    count, size = export_clouds(options.out, file), file.stat().st_size
+    emit(
+        options,
+        {"file": str(file), "clouds": count, "bytes": size},
+        [f"{file}: {count} clouds, {size / 1e6:.2f} MB"],
+    )
     return int(ExitCode.OK)
 
 
@@ -77,7 +88,8 @@ def _build(options: argparse.Namespace) -> int:
 
     plan = _plan(options)
     counts = ", ".join(f"{count} {name}" for name, count in class_counts(plan).items())
-    print(f"{len(plan.objects)} objects ({counts}), {plan.per_object} clouds each, seed {plan.seed}", flush=True)
+    if not options.json:
+        print(f"{len(plan.objects)} objects ({counts}), {plan.per_object} clouds each, seed {plan.seed}", flush=True)
     with _pool(options) as pool:
         try:
             with _stoppable():
@@ -87,7 +99,8 @@ def _build(options: argparse.Namespace) -> int:
             return INTERRUPTED
     kept = f", {built.kept} shards were there" if built.kept else ""
     remade = f", {built.damaged} damaged ones were remade" if built.damaged else ""
-    print(f"{built.clouds} clouds, {built.failed} failed{kept}{remade}: {options.out}")
+    text = f"{built.clouds} clouds, {built.failed} failed{kept}{remade}: {options.out}"
+    emit(options, {"folder": str(options.out), "objects": len(plan.objects), **asdict(built)}, [text])
     return int(ExitCode.DEGRADED if built.failed else ExitCode.OK)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edge.errors import ConfigError, ExitCode
+from train.output import on_a_screen
 
 if TYPE_CHECKING:
     from edge.frames import Pose, RadarFrame
@@ -37,6 +38,7 @@ def add_verb(verbs: Any) -> None:
         description="Emulates both radars of a rig and a pose sensor on this machine until Ctrl-C, and prints their "
         "addresses. Faults are set on the control socket, one line each (docs/simulation.md).",
     )
+    on_a_screen(verb, "NAME")
     verb.add_argument("name", help="rig: name or folder, for example cascade_pair or awr1843_pair")
     verb.add_argument("--object", metavar="REF", help="drive past this object, for example car/parametric_00012")
     verb.add_argument("--settings", type=Path, metavar="TOML", help="with --object: settings, instead of drawn ones")
