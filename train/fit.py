@@ -22,6 +22,7 @@ from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.dataset import CLASSES, CompletionDataset, mean_shape
 from train.distill import Teacher
 from train.fit_settings import NOT_IN_RESULT, FitSettings, learning_rate, new_anchor, progress
+from train.import_weights import read_weights
 from train.losses import LossTerms, Matcher, completion_loss
 from train.nearest import nearest_distance
 from train.network import PATCH_CELLS, CompletionModel
@@ -100,20 +101,26 @@ class Trainer:
 
     @staticmethod
     def _load_start(network: CompletionModel, path: Path) -> int:
-        """Averaged weights of another run; returns the samples it had seen."""
-        earlier = load_checkpoint(path)
+        """Averaged weights of another run, or those of a shipped model; returns the samples it had seen."""
+        if path.is_dir() or path.suffix == ".onnx":
+            weights, samples = read_weights(path, network)
+            kind = "a model's graph"
+        else:
+            earlier = load_checkpoint(path)
+            weights, kind = earlier.average, earlier.settings.get("network", "ours")
+            samples = earlier.samples + int(earlier.settings.get("samples_before", 0))
         refusal = ModelError(
             f"{path}: weights of another network",
-            value=earlier.settings.get("network", "ours"),
+            value=kind,
             action="fine-tune with the network and width of that run, and at least its options",
         )
         try:
-            found = network.load_state_dict(earlier.average, strict=False)
+            found = network.load_state_dict(weights, strict=False)
         except RuntimeError as error:
             raise refusal from error
         if found.unexpected_keys or not network.begin_without(found.missing_keys):
             raise refusal
-        return earlier.samples + int(earlier.settings.get("samples_before", 0))
+        return samples
 
     def _description(self) -> dict[str, Any]:
         """Settings, and what the data were drawn from; the batch is that of all processes."""

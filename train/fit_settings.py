@@ -58,7 +58,7 @@ class FitSettings:
         validation_samples: samples of the validation split, evenly spread over it.
         tensorboard: also write event files into the run folder.
         teacher: checkpoint of a trained network to learn from, "" for none.
-        start: checkpoint whose averaged weights the run begins with (fine-tuning), "" for none.
+        start: checkpoint (its averaged weights) or model folder that the run begins with, "" for none.
         loss, distill: see there.
     Raises:
         ConfigError: a number outside its range.
