@@ -138,7 +138,7 @@ def test_the_whole_package_runs_without_torch_and_keeps_its_size(tmp_path: Path)
         assert any(text.startswith(("LIC", "COPY")) for text in texts), f"{name}: no licence"
     assert (site / "onnxruntime/LICENSE").is_file()
     assert (home / "bin/rfconstruct").read_text().splitlines()[0] == "#!/opt/rfconstruct/bin/python"
-    code = "edge.pipeline, edge.stream.client; from edge.cli import main; main(['--help']); main(['doctor'])"
+    code = "import edge.pipeline, edge.stream.client; from edge.cli import main; main(['--help']); main(['doctor'])"
     command = [sys.executable, "-I", "-S", "-c", f"import sys; sys.path.insert(0, {str(site)!r}); {code}"]
     answer = subprocess.run(
         command, check=True, timeout=300, capture_output=True, text=True, env={"HOME": str(tmp_path)}
