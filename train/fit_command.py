@@ -50,7 +50,7 @@ def add_verb(verbs: Any) -> None:
     fit.add_argument("--squared", action="store_true", help="the squared distances of the paper's equations")
     fit.add_argument("--class-weight", action="append", default=[], metavar="CLASS=W", help="relative, 1 by default")
     fit.add_argument("--joint-uncertainty", action="store_true", help="the expected distance moves the points too")
-    fit.add_argument("--start", default="", metavar="MODEL", help="begin with the weights of a checkpoint or model folder")
+    fit.add_argument("--start", default="", metavar="MODEL", help="begin with its weights: checkpoint or model folder")
     fit.add_argument("--teacher", default="", metavar="CHECKPOINT", help="learn from this trained network too")
     fit.add_argument("--tensorboard", action="store_true", help="also write event files for TensorBoard")
     fit.set_defaults(run=_fit)
