@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,12 +13,14 @@ import pytest
 from cli_run import Outcome, rfconstruct
 
 from edge.commands.subscriber import require_keys, why_refused
+from edge.commands.view_command import watch_live
 from edge.config import StreamSettings
 from edge.errors import ConfigError, ExitCode
 from edge.frames import Pose
 from edge.stream.client import connect
 from edge.stream.keys import KeyFolder, create_client
 from edge.stream.publisher import Publisher
+from edge.view.health import Banner
 
 FAR = "tcp://192.0.2.1:5600"
 POSE = Pose(1, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -99,6 +102,24 @@ def test_view_receives_with_the_right_keys(
     assert outcome.code == ExitCode.OK, outcome.err
     assert heard
     assert heard[0] is not None
+
+
+def test_the_viewer_shows_that_it_is_refused(appliance: str, tmp_path: Path) -> None:
+    shown: list[Banner] = []
+
+    class Page:
+        def update(self, scene: object, banner: Banner, *rest: object) -> None:
+            shown.append(banner)
+
+    end_s = time.monotonic() + 20.0
+    with connect(appliance, keys=tmp_path / "wrong.key_secret") as client:
+
+        def stopped() -> bool:
+            return bool(shown and shown[-1].state == "REFUSED") or time.monotonic() > end_s
+
+        watch_live(Page(), client, stopped)  # type: ignore[arg-type]
+    assert (shown[-1].state, shown[-1].level) == ("REFUSED", "error")
+    assert "not let in" in shown[-1].text
 
 
 @pytest.mark.parametrize("verb", ["listen", "view", "record"])
