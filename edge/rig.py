@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -27,7 +28,8 @@ from edge.waveform import Schedule
 
 FILE_NAME = "rig.toml"
 SETTINGS = tuple(f.name for f in fields(PipelineSettings))
-TOP_KEYS = ("description", "schedule", "interleave", "geometry", "radars", "pose", *SETTINGS)
+NAME = re.compile(r"\w[\w.-]*")
+TOP_KEYS = ("name", "description", "schedule", "interleave", "geometry", "radars", "pose", *SETTINGS)
 RADAR_KEYS = ("mounting", "calibration", "schedule", "board")
 
 
@@ -72,7 +74,7 @@ class Rig:
     """The radars of a vehicle and how their frames are processed.
 
     Args:
-        name: of the folder.
+        name: as ``rig.toml`` says, or the folder's. Models are made for names: a copy of a rig may name the original.
         radars: one or two.
         geometry: how the rig stands on the vehicle.
         settings: of every stage.
@@ -177,13 +179,15 @@ def load_rig(name_or_directory: str | Path, boards: Path | None = None) -> Rig:
     place = Place(directory / FILE_NAME)
     table = read_toml(place.file)
     require_known(table, TOP_KEYS, place)
-    description = table.get("description", "")
+    name, description = table.get("name", directory.resolve().name), table.get("description", "")
     if not isinstance(description, str):
         raise place.at("description").error("wrong type", value=description, allowed="text")
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise place.at("name").error("no name of a rig", value=name, allowed=f"text like {NAME.pattern}")
     radars = _radars(table, place)
     reached, pose = read_boards(table, {r: x.schedule.is_cascade for r, x in radars.items()}, place, boards)
     rig = Rig(
-        name=directory.resolve().name,
+        name=name,
         radars=radars,
         geometry=fill(RigGeometry, subtable(table, "geometry", place), place.at("geometry")),
         settings=fill(PipelineSettings, {key: subtable(table, key, place) for key in SETTINGS}, place),

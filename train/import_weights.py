@@ -106,7 +106,7 @@ class _Reader:
         parts, bias = [of_patch, self._weight("fold_coarse") * self.scale], self.arrays["fold_global.bias"]
         if self.network.local:
             product = self._weight("fold_local").astype(np.float64)
-            of_local = product @ np.linalg.pinv(found["local2.weight"].astype(np.float64))
+            of_local = (product @ np.linalg.pinv(found["local2.weight"].astype(np.float64))).astype(np.float32)
             bias = bias - of_local @ found["local2.bias"]
             parts.append(of_local)
         parts.append(self._weight("fold_global"))

@@ -161,12 +161,18 @@ def test_wrong_value_is_shown(tmp_path):
         ("schedule = 3\n[radars.horizontal]", "must be a table"),
         ("[schedule]\nprofile = 3\nloops = 8\nframe_period_s = 0.1\n[radars.horizontal]", "must be a table"),
         ("description = 1\n" + PAIR, "text"),
+        ('name = "../x"\n' + PAIR, "name"),
         (SCHEDULE + "[radars.horizontal]\ncalibration = 1", "calibration"),
         ("[schedule\n", "not a TOML file"),
     ],
 )
 def test_wrong_structure_is_named(tmp_path, text, said):
     assert said in str(refused(tmp_path, text))
+
+
+def test_a_rig_has_the_name_it_says_or_the_folders(tmp_path):
+    assert rig_from(tmp_path, PAIR).name == tmp_path.name
+    assert rig_from(tmp_path, 'name = "cascade_pair"\n' + PAIR).name == "cascade_pair"
 
 
 def test_file_that_is_no_text_is_refused(tmp_path):
