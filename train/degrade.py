@@ -119,7 +119,7 @@ def _with(case: Case, more: np.ndarray, rng: Generator) -> Case:
     return case.seen_as(cloud[rng.permutation(len(cloud))[:_MOST_POINTS]])
 
 
-CLUTTER = ("wall", "corner", "hedge", "bush", "pole", "tree", "sign", "kerb", "box", "scatter")
+CLUTTER = ("wall", "corner", "hedge", "bush", "pole", "tree", "sign", "kerb", "box", "scatter", "reflectors")
 
 
 def clutter(kind: str, rng: Generator) -> Float32:
@@ -209,6 +209,14 @@ def _scatter(count: int, rng: Generator) -> np.ndarray:
     return rng.uniform(0, 1, (count, 3)) * rng.uniform((0.8, 0.8, 0.8), (5, 4, 3))
 
 
+def _reflectors(count: int, rng: Generator) -> np.ndarray:
+    """A few corner reflectors, lamps, bolts: points in the room, nothing between them."""
+    extent = rng.uniform((0.3, 0.3, 0.3), (5.0, 2.5, 2.0))
+    places = rng.uniform(0, 1, (int(rng.integers(1, 7)), 3)) * extent + (0, 0, 0.1)
+    chosen: np.ndarray = places[rng.integers(len(places), size=count)]
+    return chosen
+
+
 _SHAPES: dict[str, Callable[[int, Generator], np.ndarray]] = {
     "wall": _wall,
     "corner": _corner,
@@ -220,4 +228,5 @@ _SHAPES: dict[str, Callable[[int, Generator], np.ndarray]] = {
     "kerb": _kerb,
     "box": _box,
     "scatter": _scatter,
+    "reflectors": _reflectors,
 }
