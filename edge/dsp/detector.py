@@ -234,7 +234,7 @@ class Detector:
             return count
         kept = drop_sidelobes(
             *(heatmap.power, self._pattern, self._cells, self._index, count, self._axes, self._margin),
-            *(self._largest, *self._bounds, self._received, self._places),
+            *(self._largest, self._bounds[0], self._bounds[1], self._received, self._places),
         )
         self.sidelobes = count - int(kept)
         return int(kept)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numba import float32, float64, int8, int64, njit, types
 
+from edge.kernels_arrays import Float32, Int8
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 BESIDE = 1.01
@@ -15,7 +17,7 @@ BESIDE = 1.01
 
 
 @njit(types.void(float32[:, ::1], int64, float32[:, ::1], int8[:, ::1], float32[:, ::1]), **OPTIONS)
-def keep_strongest(power, k, best, which, kept):  # type: ignore[no-untyped-def]
+def keep_strongest(power: Float32, k: int, best: Float32, which: Int8, kept: Float32) -> None:
     """Copy map ``k`` to ``kept`` and into ``best`` where it is the strongest so far; map 0 forgets what was there.
 
     Args:
@@ -36,9 +38,9 @@ def keep_strongest(power, k, best, which, kept):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _set_between(maps, k, peak, r, share):  # type: ignore[no-untyped-def]
+def _set_between(maps: Float32, k: int, peak: int, r: int, share: Float32) -> np.int8:
     """Shares of three maps at the speed where the parabola through them peaks; returns the middle one's number."""
-    middle = min(max(int64(k), 1), len(maps) - 2)
+    middle: int = min(max(int64(k), 1), len(maps) - 2)  # type: ignore[assignment]
     before, at, after = maps[middle - 1, peak, r], maps[middle, peak, r], maps[middle + 1, peak, r]
     bend = before - float32(2) * at + after
     offset = float32(0.5) * (before - after) / bend if bend < 0 else float32(k - middle)
@@ -51,7 +53,16 @@ def _set_between(maps, k, peak, r, share):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _charge(line, shown, owner, response, first, begin, amplitude, number):  # type: ignore[no-untyped-def]
+def _charge(
+    line: Float32,
+    shown: Int8,
+    owner: Int8,
+    response: Float32,
+    first: int,
+    begin: int,
+    amplitude: np.float32,
+    number: int,
+) -> np.float32:
     """Add one target's lobes to the bound and note where its own are the largest; returns what exceeds the bound."""
     own, strongest = response[response.shape[0] // 2], float32(0)
     for a in range(len(shown)):
@@ -74,9 +85,9 @@ def _charge(line, shown, owner, response, first, begin, amplitude, number):  # t
     ),
     **OPTIONS,
 )
-def give_to_owners(  # type: ignore[no-untyped-def]
-    maps, best, which, pattern, response, prominent, weakest, sums, line, shown, owner, share, centre, power
-):
+def give_to_owners(maps: Float32, best: Float32, which: Int8, pattern: Float32, response: Float32, prominent: float,
+                   weakest: float, sums: Float32, line: Float32, shown: Int8, owner: Int8, share: Float32, centre: Int8,
+                   power: Float32) -> None:  # fmt: skip
     """Each cell's power from the maps of the targets that explain it; the strongest map's where they do not.
 
     Range bin by range bin, strongest first: a target stands at the strongest cell not yet explained. It adds to the

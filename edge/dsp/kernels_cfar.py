@@ -15,7 +15,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 from numba import boolean, float32, int64, njit, types, uint8, uint64
+
+from edge.kernels_arrays import Bool, Float32, Int64, UInt8
 
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
@@ -45,7 +48,9 @@ def line_cells(ranges: int, train_range: int) -> int:
 
 
 @njit(inline="always")
-def _receive(power, pattern, first, train_angle, ranges, pitch, plane):  # type: ignore[no-untyped-def]
+def _receive(
+    power: Float32, pattern: Float32, first: int, train_angle: int, ranges: int, pitch: int, plane: Float32
+) -> None:
     """Power as received, rows of ``pitch`` cells, zeros below ``first``, ``train_angle`` rows repeated at both ends."""
     angles, begin = power.shape[0], uint64(train_angle * pitch)
     for a in range(angles):
@@ -61,7 +66,9 @@ def _receive(power, pattern, first, train_angle, ranges, pitch, plane):  # type:
 
 
 @njit(inline="always")
-def _sums_of_rows(plane, x, pitch, width):  # type: ignore[no-untyped-def]
+def _sums_of_rows(
+    plane: Float32, x: np.uint64, pitch: int, width: int
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Sums over ``width`` rows of a column, from cell x and from 1, 2 and 3 rows on; what they share is added once."""
     shared = float32(0)
     if width < ROWS:
@@ -83,7 +90,18 @@ def _sums_of_rows(plane, x, pitch, width):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _sums_of_columns(plane, a, apart, guarded, ranges, pitch, all_rows, line, left, cells):  # type: ignore[no-untyped-def]
+def _sums_of_columns(
+    plane: Float32,
+    a: int,
+    apart: int,
+    guarded: int,
+    ranges: int,
+    pitch: int,
+    all_rows: bool,
+    line: Float32,
+    left: int,
+    cells: int,
+) -> None:
     """Sums over the rows of the rings around angle rows a..a + 3, column by column, into lines of ``cells`` each.
 
     Lines 0..3 receive the sums over the 2 * ``apart`` rows beyond the guarded ones, lines 4..7 those over the
@@ -105,7 +123,7 @@ def _sums_of_columns(plane, a, apart, guarded, ranges, pitch, all_rows, line, le
 
 
 @njit(inline="always")
-def _sums_along(line, start, width, count, into):  # type: ignore[no-untyped-def]
+def _sums_along(line: Float32, start: int, width: int, count: int, into: int) -> None:
     """line[into + x] = sum of ``width`` cells from ``start + x`` on, x < ``count``."""
     for n in range(count):
         x = uint64(start) + uint64(n)
@@ -136,7 +154,16 @@ def ring_mean_kernel(
     pairs, outer = 2 * ROWS * cells, (2 * ROWS + 1) * cells
 
     @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
-    def kernel(power, pattern, first, inverse_count, floor, plane, line, noise):  # type: ignore[no-untyped-def]
+    def kernel(
+        power: Float32,
+        pattern: Float32,
+        first: int,
+        inverse_count: Float32,
+        floor: Float32,
+        plane: Float32,
+        line: Float32,
+        noise: Float32,
+    ) -> None:
         _receive(power, pattern, first, train_angle, ranges, pitch, plane)
         for a in range(0, power.shape[0], ROWS):
             _sums_of_columns(plane, a, apart, guarded, ranges, pitch, True, line, left, cells)
@@ -182,7 +209,16 @@ def ring_halves_kernel(
     outer, inner = 2 * ROWS * cells, (2 * ROWS + 1) * cells
 
     @njit(types.void(*MEAN_ARGUMENTS), **OPTIONS)
-    def kernel(power, pattern, first, inverse_count, floor, plane, line, noise):  # type: ignore[no-untyped-def]
+    def kernel(
+        power: Float32,
+        pattern: Float32,
+        first: int,
+        inverse_count: Float32,
+        floor: Float32,
+        plane: Float32,
+        line: Float32,
+        noise: Float32,
+    ) -> None:
         _receive(power, pattern, first, train_angle, ranges, pitch, plane)
         for a in range(0, power.shape[0], ROWS):
             _sums_of_columns(plane, a, apart, guarded, ranges, pitch, False, line, left, cells)
@@ -202,7 +238,9 @@ def ring_halves_kernel(
 
 
 @njit(types.void(MATRIX, float32[::1], MATRIX, float32[::1], int64, boolean[:, ::1]), **OPTIONS)
-def mean_decisions(power, pattern, noise, factor, first, decided):  # type: ignore[no-untyped-def]
+def mean_decisions(
+    power: Float32, pattern: Float32, noise: Float32, factor: Float32, first: int, decided: Bool
+) -> None:
     """Decision of every cell: received power > factor[range] * noise, before any local-maximum test."""
     for a in range(power.shape[0]):
         for r in range(power.shape[1]):
@@ -210,14 +248,14 @@ def mean_decisions(power, pattern, noise, factor, first, decided):  # type: igno
 
 
 @njit(inline="always")
-def _largest(power, a, r):  # type: ignore[no-untyped-def]
+def _largest(power: Float32, a: int, r: int) -> np.float32:
     """Largest of a cell and those beside it in range."""
     last = power.shape[1] - 1
     return max(max(power[a, max(r - 1, 0)], power[a, min(r + 1, last)]), power[a, r])
 
 
 @njit(inline="always")
-def is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
+def is_peak(power: Float32, pattern: Float32, a: int, r: int) -> bool:
     """Largest received power of its 3 x 3 neighbourhood; of equal neighbours the first in raster order is the peak."""
     angles, ranges = power.shape
     above = a - 1 if a > 0 else angles - 1
@@ -232,7 +270,7 @@ def is_peak(power, pattern, a, r):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _mark(power, pattern, noise, factor, first, a, mark):  # type: ignore[no-untyped-def]
+def _mark(power: Float32, pattern: Float32, noise: Float32, factor: Float32, first: int, a: int, mark: UInt8) -> None:
     """1 where a tested cell of a row exceeds its threshold and is no less than its neighbours in angle, else 0."""
     angles, ranges = power.shape
     above, below = (a + angles - 1) % angles, (a + 1) % angles
@@ -249,7 +287,17 @@ PEAK_ARGUMENTS = (MATRIX, float32[::1], MATRIX, float32[::1], int64, uint8[::1],
 
 
 @njit(int64(*PEAK_ARGUMENTS), **OPTIONS)
-def mean_peaks(power, pattern, noise, factor, first, mark, words, cells, estimate):  # type: ignore[no-untyped-def]
+def mean_peaks(
+    power: Float32,
+    pattern: Float32,
+    noise: Float32,
+    factor: Float32,
+    first: int,
+    mark: UInt8,
+    words: Int64,
+    cells: Int64,
+    estimate: Float32,
+) -> int:
     """Local maxima of the received power that exceed the threshold of a noise map.
 
     Args:

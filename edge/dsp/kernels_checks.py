@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 from numba import boolean, int32, int64, njit, types, uint8
 
+from edge.kernels_arrays import Int32, Int64, UInt8
+
 RAW = types.Array(int32, 1, "C", readonly=True)
 # A microsecond each: to give the interpreter's lock away and wait for it again could take longer.
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "boundscheck": False, "cache": True}
 
 
 @njit(boolean(RAW), **OPTIONS)
-def all_zero(adc):  # type: ignore[no-untyped-def]
+def all_zero(adc: Int32) -> bool:
     """True when every value of ``adc`` [values / 2] is zero; stops at the first that is not."""
     for x in range(len(adc)):  # noqa: SIM110 - a kernel
         if adc[x] != 0:
@@ -23,7 +25,7 @@ def all_zero(adc):  # type: ignore[no-untyped-def]
 
 
 @njit(int64(RAW, int64[:, ::1], int64, int64, int64, uint8[:, ::1]), **OPTIONS)
-def dead_channels(adc, start, samples, step, word, dead):  # type: ignore[no-untyped-def]
+def dead_channels(adc: Int32, start: Int64, samples: int, step: int, word: int, dead: UInt8) -> int:
     """Mark the channels whose first chirp is constant; stops at each channel's first change.
 
     Args:

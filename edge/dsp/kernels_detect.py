@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numba import float32, float64, int64, njit, types
 
+from edge.kernels_arrays import Float32, Float64, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 LARGEST_PARABOLA = 0.5
 DEFOCUS_STEP_PER_M = 0.01
@@ -15,7 +17,7 @@ DEFOCUS_STEP_PER_M = 0.01
 
 
 @njit(inline="always")
-def _sink(value, index, root, size):  # type: ignore[no-untyped-def]
+def _sink(value: Float32, index: Int64, root: int, size: int) -> None:
     """Restore the min-heap below ``root``."""
     while 2 * root + 1 < size:
         child = 2 * root + 1
@@ -29,7 +31,7 @@ def _sink(value, index, root, size):  # type: ignore[no-untyped-def]
 
 
 @njit(int64(float32[:, ::1], int64[::1], int64, int64, float32[::1], int64[::1]), **OPTIONS)
-def strongest(power, cells, count, most, value, index):  # type: ignore[no-untyped-def]
+def strongest(power: Float32, cells: Int64, count: int, most: int, value: Float32, index: Int64) -> int:
     """Pick the strongest peaks, strongest first (heap selection, n log most).
 
     Args:
@@ -60,7 +62,16 @@ def strongest(power, cells, count, most, value, index):  # type: ignore[no-untyp
 
 
 @njit(inline="always")
-def _is_explained(value, place, count, n, margin, largest, range_bound, angle_bound):  # type: ignore[no-untyped-def]
+def _is_explained(
+    value: Float32,
+    place: Int64,
+    count: int,
+    n: int,
+    margin: float,
+    largest: float,
+    range_bound: Float32,
+    angle_bound: Float32,
+) -> bool:
     """Whether the sidelobes of one of ``count`` peaks bound peak n from above, see ``drop_sidelobes``."""
     a, r = place[0, n], place[1, n]
     for m in range(count):
@@ -75,21 +86,32 @@ def _is_explained(value, place, count, n, margin, largest, range_bound, angle_bo
 
 
 @njit(inline="always")
-def _defocus_level(range_m, cosine, focus_inverse_m, levels):  # type: ignore[no-untyped-def]
+def _defocus_level(range_m: float, cosine: float, focus_inverse_m: float, levels: int) -> int:
     """Row of the angle bounds for a point at (range, cosine)."""
     inverse = 0.5 / max(range_m, 0.05)
     focused = focus_inverse_m if focus_inverse_m >= 0.0 else inverse
     left = abs((1.0 - min(cosine * cosine, 1.0)) * inverse - focused)
-    return min(int64(np.ceil(left / DEFOCUS_STEP_PER_M)), levels - 1)
+    return min(int64(np.ceil(left / DEFOCUS_STEP_PER_M)), levels - 1)  # type: ignore[call-overload, no-any-return]
 
 
 SIDELOBE_ARGUMENTS = (float32[:, ::1], float32[::1], int64[::1], int64[::1], int64, float64[::1], float32, float32)
 
 
 @njit(int64(*SIDELOBE_ARGUMENTS, float32[::1], float32[:, ::1], float32[::1], int64[:, ::1]), **OPTIONS)
-def drop_sidelobes(  # type: ignore[no-untyped-def]
-    power, pattern, cells, index, count, axes, margin, largest, range_bound, angle_bound, value, place
-):
+def drop_sidelobes(
+    power: Float32,
+    pattern: Float32,
+    cells: Int64,
+    index: Int64,
+    count: int,
+    axes: Float64,
+    margin: float,
+    largest: float,
+    range_bound: Float32,
+    angle_bound: Float32,
+    value: Float32,
+    place: Int64,
+) -> int:
     """Leave out peaks that the windows' sidelobes of another peak explain.
 
     Peak n goes when some peak m has P_n < margin P_m B_r(dr) B_a(da), powers as received. Within the main lobe of both
@@ -126,7 +148,7 @@ def drop_sidelobes(  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _offset(minus, centre, plus, spread, fit):  # type: ignore[no-untyped-def]
+def _offset(minus: float, centre: float, plus: float, spread: float, fit: Float64) -> tuple[float, float]:
     """Sub-bin offset, within half a bin, and the factor from the centre amplitude to the peak's."""
     bend = 2.0 * centre - minus - plus
     if fit[9] > 0.0:
@@ -142,22 +164,22 @@ def _offset(minus, centre, plus, spread, fit):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _amplitude(power, pattern, a, r):  # type: ignore[no-untyped-def]
+def _amplitude(power: Float32, pattern: Float32, a: int, r: int) -> float:
     """Received amplitude of a cell; r outside the map gives 0."""
     angles, ranges = power.shape
     row = (a + angles) % angles
     if r < 0 or r >= ranges:
         return 0.0
-    return np.sqrt(float64(power[row, r]) * float64(pattern[row]))
+    return np.sqrt(float64(power[row, r]) * float64(pattern[row]))  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
-def _pattern_at(pattern, a, offset):  # type: ignore[no-untyped-def]
+def _pattern_at(pattern: Float32, a: int, offset: float) -> float:
     """The antenna pattern ``offset`` rows beside row ``a``, linear between rows."""
     angles = len(pattern)
     beside = (a + 1) % angles if offset > 0.0 else (a + angles - 1) % angles
     share = abs(offset)
-    return (1.0 - share) * float64(pattern[a]) + share * float64(pattern[beside])
+    return (1.0 - share) * float64(pattern[a]) + share * float64(pattern[beside])  # type: ignore[no-any-return]
 
 
 FIT = float64[::1]
@@ -171,7 +193,18 @@ FIT = float64[::1]
     ),
     **OPTIONS,
 )
-def refine(power, pattern, cells, index, estimate, count, range_fit, angle_fit, axes, out):  # type: ignore[no-untyped-def]
+def refine(
+    power: Float32,
+    pattern: Float32,
+    cells: Int64,
+    index: Int64,
+    estimate: Float32,
+    count: int,
+    range_fit: Float64,
+    angle_fit: Float64,
+    axes: Float64,
+    out: Float32,
+) -> None:
     """Positions and powers of detected cells: interpolated as received, then compensated at their own direction.
 
     The compensation grows with the angle, so that it shifts the peak of a wide lobe outwards: by more than half a bin

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numba import complex64, float32, float64, int8, int64, njit, types, uint64
 
+from edge.kernels_arrays import Complex64, Float32, Float64, Int8, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 PADDING = 16
@@ -48,7 +50,9 @@ def channel_kernel(points: int, rx: int) -> Callable[..., Any]:
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(spectra, focus, rows, channel, work, loop, cube):  # type: ignore[no-untyped-def]
+    def kernel(
+        spectra: Float32, focus: Float32, rows: Int64, channel: Int64, work: Float32, loop: int, cube: Float32
+    ) -> None:
         for b in range(len(channel)):
             spectrum = spectra[b]
             for x in range(im):
@@ -69,7 +73,7 @@ def channel_kernel(points: int, rx: int) -> Callable[..., Any]:
 
 
 @njit(inline="always")
-def _smooth(fine, kernel, begin, end, out):  # type: ignore[no-untyped-def]
+def _smooth(fine: Float64, kernel: Float64, begin: int, end: int, out: Float64) -> None:
     """``out`` = ``fine`` convolved with the symmetric ``kernel`` of odd length, from ``begin`` to before ``end``."""
     first = uint64(begin - len(kernel) // 2)
     for x in range(end - begin):
@@ -88,9 +92,9 @@ def _smooth(fine, kernel, begin, end, out):  # type: ignore[no-untyped-def]
     ),
     **OPTIONS,
 )
-def plan_spreading(  # type: ignore[no-untyped-def]
-    position, slot, time, drift, middle, loops, rounds, density, taper, shape, fine, weight, first, taps
-):
+def plan_spreading(position: Float64, slot: Int64, time: Float64, drift: float, middle: float, loops: int, rounds: int,
+                   density: Float64, taper: Float64, shape: Float64, fine: Float64, weight: Float64, first: Int64,
+                   taps: Float32) -> None:  # fmt: skip
     """Where every element stands by the time of its chirp, and its weight, spread on the grid of the row.
 
     Element n of loop l stands at position + drift t. Weights are the inverse density of elements, by the iteration
@@ -151,7 +155,7 @@ def plan_spreading(  # type: ignore[no-untyped-def]
 
 
 @njit(types.void(complex64[:, ::1], float64[:, ::1], float64, float64), **OPTIONS)
-def set_turns(turn, time, closing_m_s, wavelength_m):  # type: ignore[no-untyped-def]
+def set_turns(turn: Complex64, time: Float64, closing_m_s: float, wavelength_m: float) -> None:
     """exp(j 4 pi c t / lambda): what undoes the closing speed c; turn, time [loop, slot]."""
     for l in range(turn.shape[0]):  # noqa: E741
         for s in range(turn.shape[1]):
@@ -166,7 +170,9 @@ def set_turns(turn, time, closing_m_s, wavelength_m):  # type: ignore[no-untyped
     ),
     **OPTIONS,
 )
-def spread(cube, slot, loops, turn, first, taps, line, row):  # type: ignore[no-untyped-def]
+def spread(
+    cube: Float32, slot: Int64, loops: int, turn: Complex64, first: Int64, taps: Float32, line: Float32, row: Float32
+) -> None:
     """Turn every channel of every loop and add it to its cells of the grid.
 
     Args:
@@ -197,7 +203,7 @@ def spread(cube, slot, loops, turn, first, taps, line, row):  # type: ignore[no-
 
 
 @njit(types.void(float32[:, :, :, ::1], float32[:, ::1]), **OPTIONS)
-def doppler_fft(cube, twiddle):  # type: ignore[no-untyped-def]
+def doppler_fft(cube: Float32, twiddle: Float32) -> None:
     """FFT over loops in place, radix 2, decimation in frequency: bin k stands where its bits are reversed.
 
     Args:
@@ -238,7 +244,16 @@ def doppler_fft(cube, twiddle):  # type: ignore[no-untyped-def]
     ),
     **OPTIONS,
 )
-def resolve_folds(cube, d, pairs, distances, hypothesis, work, score, fold):  # type: ignore[no-untyped-def]
+def resolve_folds(
+    cube: Float32,
+    d: int,
+    pairs: Int64,
+    distances: int,
+    hypothesis: Complex64,
+    work: Float32,
+    score: Float32,
+    fold: Int8,
+) -> None:
     """Which multiple of the ambiguous speed the doubled elements agree with, range bin by range bin.
 
     sum over pairs of late conj(early), grouped by their distance d in slots, has the phase 2 pi f d, f the Doppler
@@ -281,7 +296,9 @@ def resolve_folds(cube, d, pairs, distances, hypothesis, work, score, fold):  # 
     ),
     **OPTIONS,
 )
-def doppler_row(cube, d, slot, element, turns, fold, turn, row):  # type: ignore[no-untyped-def]
+def doppler_row(
+    cube: Float32, d: int, slot: Int64, element: Int64, turns: Float32, fold: Int8, turn: Float32, row: Float32
+) -> None:
     """Undo one Doppler bin's phase between slots and fill the virtual row.
 
     Args:
@@ -308,7 +325,7 @@ def doppler_row(cube, d, slot, element, turns, fold, turn, row):  # type: ignore
 
 
 @njit(types.void(float32[:, ::1], float32, float32[:, ::1]), **OPTIONS)
-def keep_larger(other, keep, power):  # type: ignore[no-untyped-def]
+def keep_larger(other: Float32, keep: float, power: Float32) -> None:
     """power = max(keep power, other), both [angle, range] and not negative; ``keep`` 0 forgets what was there."""
     for a in range(power.shape[0]):
         for k in range(power.shape[1]):

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numba import complex64, complex128, float32, float64, int32, int64, njit, types, uint64
 
+from edge.kernels_arrays import Complex64, Complex128, Float32, Float64, Int32, Int64
+
 RAIL = 32767
 RECEIVERS = 4
 """Of one device, all there are: their float32 values are moved as one complex128."""
@@ -30,7 +32,8 @@ RAW = types.Array(int32, 1, "C", readonly=True)
 
 
 @njit(inline="always")
-def _butterfly(work, x, q, im, w1r, w1i, w2r, w2i, w3r, w3i, sign):  # type: ignore[no-untyped-def]
+def _butterfly(work: Float32, x: int, q: int, im: int, w1r: np.float32, w1i: np.float32, w2r: np.float32,
+               w2i: np.float32, w3r: np.float32, w3i: np.float32, sign: np.float32) -> None:  # fmt: skip
     """Radix-4 butterfly on work[x + {0, q, 2q, 3q}], then the twiddles; ``sign`` of the exponent is +1 or -1."""
     ar, ai = work[x], work[x + im]
     br, bi = work[x + q], work[x + q + im]
@@ -48,7 +51,7 @@ def _butterfly(work, x, q, im, w1r, w1i, w2r, w2i, w3r, w3i, sign):  # type: ign
 
 
 @njit(inline="always")
-def _wide_stage(work, twiddle, first, groups, q, im):  # type: ignore[no-untyped-def]
+def _wide_stage(work: Float32, twiddle: Float32, first: int, groups: int, q: int, im: int) -> None:
     """Stage of the range FFT: ``q`` = quarter x receivers contiguous lanes, twiddles expanded to the lanes."""
     for g in range(groups):
         for l in range(q):  # noqa: E741
@@ -59,7 +62,7 @@ def _wide_stage(work, twiddle, first, groups, q, im):  # type: ignore[no-untyped
 
 
 @njit(inline="always")
-def _narrow_stage(work, twiddle, first, groups, quarter, lanes, im):  # type: ignore[no-untyped-def]
+def _narrow_stage(work: Float32, twiddle: Float32, first: int, groups: int, quarter: int, lanes: int, im: int) -> None:
     """Stage of the angle FFT: the inner loop runs over ``lanes`` range bins, twiddles are scalars."""
     for g in range(groups):
         for p in range(quarter):
@@ -72,7 +75,7 @@ def _narrow_stage(work, twiddle, first, groups, quarter, lanes, im):  # type: ig
 
 
 @njit(inline="always")
-def _last_stage(work, groups, lanes, im, sign):  # type: ignore[no-untyped-def]
+def _last_stage(work: Float32, groups: int, lanes: int, im: int, sign: np.float32) -> None:
     """Radix-4 stage of quarter 1: no twiddles."""
     for g in range(groups):
         for l in range(lanes):  # noqa: E741
@@ -90,7 +93,7 @@ def _last_stage(work, groups, lanes, im, sign):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
+def _pair_stage(work: Float32, groups: int, lanes: int, im: int) -> None:
     """Final radix-2 stage of lengths 2 * 4^k."""
     for g in range(groups):
         for l in range(lanes):  # noqa: E741
@@ -102,13 +105,14 @@ def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _at_rail(value):  # type: ignore[no-untyped-def]
+def _at_rail(value: np.float32) -> np.float32:
     """1 when a code stands at the converter's rails, else 0; a float, which vectorises."""
     return float32(1) if abs(value) >= float32(RAIL) else float32(0)
 
 
 @njit(inline="always")
-def _add_interleaved(adc, start, count, keep, acc, to_i, to_q):  # type: ignore[no-untyped-def]
+def _add_interleaved(adc: Int32, start: int, count: int, keep: np.float32, acc: Float32, to_i: int,
+                     to_q: int) -> np.float32:  # fmt: skip
     """acc = keep acc + one chirp of one device, [sample, rx] of packed (I, Q); returns the codes at the rails."""
     rails, begin = float32(0), uint64(start)
     for x in range(count):
@@ -121,7 +125,8 @@ def _add_interleaved(adc, start, count, keep, acc, to_i, to_q):  # type: ignore[
 
 
 @njit(inline="always")
-def _add_pairwise(adc, start, samples, rx, keep, acc, to_first, to_second):  # type: ignore[no-untyped-def]
+def _add_pairwise(adc: Int32, start: int, samples: int, rx: int, keep: np.float32, acc: Float32, to_first: int,
+                  to_second: int) -> np.float32:  # fmt: skip
     """acc = keep acc + one chirp, [rx, sample pair, 2 of one part, 2 of the other]; returns the codes at the rails."""
     rails = float32(0)
     for r in range(rx):
@@ -141,7 +146,7 @@ def _add_pairwise(adc, start, samples, rx, keep, acc, to_first, to_second):  # t
 
 
 @njit(inline="always")
-def _add_real(adc, start, samples, rx, keep, acc):  # type: ignore[no-untyped-def]
+def _add_real(adc: Int32, start: int, samples: int, rx: int, keep: np.float32, acc: Float32) -> np.float32:
     """acc = keep acc + one chirp, [rx, sample], real; returns the codes at the rails."""
     rails, words = float32(0), samples // 2
     for r in range(rx):
@@ -156,7 +161,7 @@ def _add_real(adc, start, samples, rx, keep, acc):  # type: ignore[no-untyped-de
 
 
 @njit(inline="always")
-def _window(acc, window, b, work, im):  # type: ignore[no-untyped-def]
+def _window(acc: Float32, window: Float32, b: int, work: Float32, im: int) -> None:
     """Multiply the sums by the block's complex window: taper, channel gain, range shift, scale."""
     for x in range(im):
         re, wr = acc[x], window[b, 0, x]
@@ -166,7 +171,7 @@ def _window(acc, window, b, work, im):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _turn(work, out, order, groups, last, half):  # type: ignore[no-untyped-def]
+def _turn(work: Complex128, out: Complex128, order: Int64, groups: int, last: int, half: int) -> None:
     """Rows of all receivers: ``out[p, k] = work[order[k] + p]``, p the last digit; two planes of ``half`` rows."""
     for p in range(last):
         for k in range(groups):
@@ -176,7 +181,8 @@ def _turn(work, out, order, groups, last, half):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _focus(spectra, focus, b, pr, pi, points, rx, im, work):  # type: ignore[no-untyped-def]
+def _focus(spectra: Float32, focus: Float32, b: int, pr: np.float32, pi: np.float32, points: int, rx: int, im: int,
+           work: Float32) -> None:  # fmt: skip
     """A block's spectra times focusing phasor, taper and the slot's Doppler phasor into work [(re, im), rx, point]."""
     for k in range(points):
         for r in range(rx):
@@ -212,9 +218,9 @@ def range_kernel(kind: str, swapped: bool, points: int) -> Callable[..., Any]:
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(  # type: ignore[no-untyped-def]
-        adc, loops, loop_stride, start, samples, window, twiddle, order, acc, work, work_rows, spectra, spectra_rows
-    ):
+    def kernel(adc: Int32, loops: int, loop_stride: int, start: Int64, samples: int, window: Float32, twiddle: Float32,
+               order: Int64, acc: Float32, work: Float32, work_rows: Complex128, spectra: Float32,
+               spectra_rows: Complex128) -> int:  # fmt: skip
         rails = 0
         to_i = im if swapped else 0
         for b in range(len(start)):
@@ -222,11 +228,11 @@ def range_kernel(kind: str, swapped: bool, points: int) -> Callable[..., Any]:
                 first = start[b] + loop * loop_stride
                 keep = float32(loop > 0)
                 if interleaved:
-                    rails += int64(_add_interleaved(adc, first, samples * rx, keep, acc, to_i, im - to_i))
+                    rails += int64(_add_interleaved(adc, first, samples * rx, keep, acc, to_i, im - to_i))  # type: ignore[call-overload]
                 elif real:
-                    rails += int64(_add_real(adc, first, samples, rx, keep, acc))
+                    rails += int64(_add_real(adc, first, samples, rx, keep, acc))  # type: ignore[call-overload]
                 else:
-                    rails += int64(_add_pairwise(adc, first, samples, rx, keep, acc, to_i, im - to_i))
+                    rails += int64(_add_pairwise(adc, first, samples, rx, keep, acc, to_i, im - to_i))  # type: ignore[call-overload]
             _window(acc, window, b, work, im)
             _wide_stage(work, twiddle, 0, 1, im // 4, im)
             _wide_stage(work, twiddle, 2 * (im - im // 4), 4, im // 16, im)
@@ -263,7 +269,9 @@ def row_kernel(points: int) -> Callable[..., Any]:
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(spectra, slot, element, focus, phasor, work, row):  # type: ignore[no-untyped-def]
+    def kernel(
+        spectra: Float32, slot: Int64, element: Int64, focus: Float32, phasor: Complex64, work: Float32, row: Float32
+    ) -> None:
         row[:] = float32(0)
         for b in range(len(slot)):
             turn = phasor[slot[b]]
@@ -279,7 +287,7 @@ def row_kernel(points: int) -> Callable[..., Any]:
 
 
 @njit(types.void(complex64[::1], float64, float64[::1], float64, float64), **{**OPTIONS, "nogil": False})
-def set_phasors(phasor, radial_m_s, time_s, wavelength_m, loops):  # type: ignore[no-untyped-def]
+def set_phasors(phasor: Complex64, radial_m_s: float, time_s: Float64, wavelength_m: float, loops: float) -> None:
     """Factors that undo a radial speed between slots: exp(-j 4 pi v t_s / lambda) / loops.
 
     Args:
@@ -295,7 +303,9 @@ def set_phasors(phasor, radial_m_s, time_s, wavelength_m, loops):  # type: ignor
 
 
 @njit(inline="always")
-def _pruned_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # type: ignore[no-untyped-def]
+def _pruned_stage(
+    row: Float32, column: int, elements: int, work: Float32, twiddle: Float32, quarter: int, lanes: int, im: int
+) -> None:
     """Load a chunk of the row and do the first stage; rows from ``elements`` (at most half the length) on are zero."""
     for e in range(elements):
         for l in range(lanes):  # noqa: E741
@@ -327,7 +337,9 @@ def _pruned_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # 
 
 
 @njit(inline="always")
-def _whole_stage(row, column, elements, work, twiddle, quarter, lanes, im):  # type: ignore[no-untyped-def]
+def _whole_stage(
+    row: Float32, column: int, elements: int, work: Float32, twiddle: Float32, quarter: int, lanes: int, im: int
+) -> None:
     """Load a chunk of a row of any number of elements up to the FFT's length and do the first stage."""
     for e in range(4 * quarter):
         keep, source = float32(e < elements), min(e, elements - 1)
@@ -358,7 +370,8 @@ def angle_kernel(bins: int, points: int, lanes: int, whole: bool = False) -> Cal
     )
 
     @njit(signature, **OPTIONS)
-    def kernel(row, twiddle, target, gain, first, last, work, power):  # type: ignore[no-untyped-def]
+    def kernel(row: Float32, twiddle: Float32, target: Int64, gain: Float32, first: int, last: int, work: Float32,
+               power: Float32) -> None:  # fmt: skip
         for column in range(0, points, lanes):
             if whole:
                 _whole_stage(row, column, row.shape[1], work, twiddle, bins // 4, lanes, im)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import boolean, float32, int32, int64, njit, types, uint64
 
 from edge.dsp.kernels_cfar import MATRIX, OPTIONS, is_peak
+from edge.kernels_arrays import Bool, Float32, Int32, Int64
 
 INFINITE = np.int32(0x7F800000)
 """Bits of the float32 infinity."""
@@ -23,7 +24,7 @@ SELECTED = 64
 
 
 @njit(inline="always")
-def _pad(power, pattern, first, train_angle, train, padded):  # type: ignore[no-untyped-def]
+def _pad(power: Float32, pattern: Float32, first: int, train_angle: int, train: int, padded: Float32) -> None:
     """Copy the tested ranges, as received, into ``padded`` [A + 2 train_angle, R + 2 train], closed in angle; its other
     cells hold -1 and count nowhere.
     """
@@ -39,7 +40,15 @@ def _pad(power, pattern, first, train_angle, train, padded):  # type: ignore[no-
 
 
 @njit(inline="always")
-def _reaching(padded, row, column, rows, columns, factor, bound):  # type: ignore[no-untyped-def]
+def _reaching(
+    padded: Float32,
+    row: int | np.uint64,
+    column: int | np.uint64,
+    rows: int,
+    columns: int,
+    factor: np.float32,
+    bound: np.float32,
+) -> np.float32:
     """Cells x of a box that have factor x >= bound; the inner loop goes over rows, the outer one is vectorised."""
     count = float32(0)
     row, column = uint64(row), uint64(column)
@@ -50,7 +59,17 @@ def _reaching(padded, row, column, rows, columns, factor, bound):  # type: ignor
 
 
 @njit(inline="always")
-def _exceeds_rank(padded, a, r, guard_angle, train_angle, guard, train, factor, allowed):  # type: ignore[no-untyped-def]
+def _exceeds_rank(
+    padded: Float32,
+    a: int,
+    r: int,
+    guard_angle: int,
+    train_angle: int,
+    guard: int,
+    train: int,
+    factor: np.float32,
+    allowed: int,
+) -> bool | np.bool_:
     """True when at most ``allowed`` ring cells x have factor x >= the cell's power, that is power > factor x_(k)."""
     bound = padded[a + train_angle, r + train]
     beside, behind = train_angle - guard_angle, train_angle + guard_angle + 1
@@ -67,7 +86,7 @@ def _exceeds_rank(padded, a, r, guard_angle, train_angle, guard, train, factor, 
 
 
 @njit(inline="always")
-def _select(bits, count, rank):  # type: ignore[no-untyped-def]
+def _select(bits: Int32, count: int, rank: int) -> int:
     """Place of the ``rank``-th smallest (1 = least) of the first ``count`` values, which are given as bit patterns.
 
     Floats that are not negative are ordered as their patterns read as integers, and -1 stands below all; a bisection
@@ -90,7 +109,18 @@ def _select(bits, count, rank):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, allowed, scratch, bits):  # type: ignore[no-untyped-def]
+def _ordered_statistic(
+    padded: Float32,
+    a: int,
+    r: int,
+    guard_angle: int,
+    train_angle: int,
+    guard: int,
+    train: int,
+    allowed: int,
+    scratch: Float32,
+    bits: Int32,
+) -> np.float32:
     """x_(k) of the ring around one cell."""
     count, side = 0, train - guard
     for t in range(2 * train_angle + 1):
@@ -106,11 +136,11 @@ def _ordered_statistic(padded, a, r, guard_angle, train_angle, guard, train, all
     whole = -(-count // SELECTED) * SELECTED
     for n in range(count, whole):
         bits[n] = INFINITE
-    return scratch[_select(bits, whole, count - allowed)]
+    return scratch[_select(bits, whole, count - allowed)]  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
-def _mark_peaks(power, pattern, a, mark):  # type: ignore[no-untyped-def]
+def _mark_peaks(power: Float32, pattern: Float32, a: int, mark: Float32) -> None:
     """For every range cell of one row: 2 received more than all 8 neighbours, 1 as much as the largest, 0 less."""
     angles, ranges = power.shape
     above, below = (a + angles - 1) % angles, (a + 1) % angles
@@ -140,7 +170,17 @@ def rank_peaks_kernel(guard_angle: int, train_angle: int, guard_range: int, trai
         int64(MATRIX, float32[::1], int64, float32[::1], int64[::1], MATRIX, float32[::1], int64[::1], int64[::1]),
         **OPTIONS,
     )
-    def kernel(power, pattern, first, factor, allowed, padded, mark, places, cells):  # type: ignore[no-untyped-def]
+    def kernel(
+        power: Float32,
+        pattern: Float32,
+        first: int,
+        factor: Float32,
+        allowed: Int64,
+        padded: Float32,
+        mark: Float32,
+        places: Int64,
+        cells: Int64,
+    ) -> int:
         angles, ranges = power.shape
         count = 0
         _pad(power, pattern, first, train_angle, train_range, padded)
@@ -178,7 +218,17 @@ def rank_noise_kernel(guard_angle: int, train_angle: int, guard_range: int, trai
     signature = types.void(MATRIX, int64, *3 * (int64[::1],), int64, float32[::1], int32[::1], float32[::1])
 
     @njit(signature, **OPTIONS)
-    def kernel(padded, ranges, allowed, cells, index, count, scratch, bits, estimate):  # type: ignore[no-untyped-def]
+    def kernel(
+        padded: Float32,
+        ranges: int,
+        allowed: Int64,
+        cells: Int64,
+        index: Int64,
+        count: int,
+        scratch: Float32,
+        bits: Int32,
+        estimate: Float32,
+    ) -> None:
         for n in range(count):
             a, r = cells[index[n]] // ranges, cells[index[n]] % ranges
             estimate[index[n]] = _ordered_statistic(
@@ -200,7 +250,9 @@ def rank_decisions_kernel(guard_angle: int, train_angle: int, guard_range: int, 
     signature = types.void(MATRIX, float32[::1], int64, float32[::1], int64[::1], MATRIX, boolean[:, ::1])
 
     @njit(signature, **OPTIONS)
-    def kernel(power, pattern, first, factor, allowed, padded, decided):  # type: ignore[no-untyped-def]
+    def kernel(
+        power: Float32, pattern: Float32, first: int, factor: Float32, allowed: Int64, padded: Float32, decided: Bool
+    ) -> None:
         _pad(power, pattern, first, train_angle, train_range, padded)
         for a in range(power.shape[0]):
             for r in range(first, power.shape[1]):

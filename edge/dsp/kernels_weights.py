@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, njit
 
+from edge.kernels_arrays import Bool, Float32, Float64, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 KEPT_EMPHASIS = 0.2
@@ -21,14 +23,14 @@ PLANE, WHOLE = float64[:, ::1], int64[:, ::1]
 
 
 @njit(inline="always")
-def _copy(source, target):  # type: ignore[no-untyped-def]
+def _copy(source: Float64, target: Float64) -> None:
     """Value by value: a copy of a slice would compile a second for its error message."""
     for i in range(len(target)):
         target[i] = source[i]
 
 
 @njit(inline="always")
-def _turns(step, out):  # type: ignore[no-untyped-def]
+def _turns(step: Float64, out: Float32) -> None:
     """out [(cos, sin), n, points] = exp(j n step), by recurrence."""
     for p in range(len(step)):
         out[0, 0, p], out[1, 0, p] = 1.0, 0.0
@@ -43,7 +45,9 @@ def _turns(step, out):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _right_hand_side(step, share, wanted, place, emphasis, right):  # type: ignore[no-untyped-def]
+def _right_hand_side(
+    step: Float64, share: Float64, wanted: Float64, place: Float64, emphasis: Float32, right: Float64
+) -> None:
     """Sum over points of emphasis share^2 wanted cos(phase), by channel."""
     right[:] = 0.0
     for p in range(len(share)):
@@ -54,7 +58,17 @@ def _right_hand_side(step, share, wanted, place, emphasis, right):  # type: igno
 
 
 @njit(inline="always")
-def _normal_matrix(along, late, share, emphasis, pair, of, ridge, sums, normal):  # type: ignore[no-untyped-def]
+def _normal_matrix(
+    along: Float32,
+    late: Float32,
+    share: Float64,
+    emphasis: Float32,
+    pair: Int64,
+    of: Int64,
+    ridge: float,
+    sums: Float64,
+    normal: Float64,
+) -> None:
     """Lower triangle of sum over points of emphasis share^2 cos(difference of two channels' phases), and the ridge."""
     points = len(share)
     for s in range(late.shape[1]):
@@ -75,7 +89,7 @@ def _normal_matrix(along, late, share, emphasis, pair, of, ridge, sums, normal):
 
 
 @njit(inline="always")
-def _solve(normal, x):  # type: ignore[no-untyped-def]
+def _solve(normal: Float64, x: Float64) -> None:
     """x <- normal^-1 x for a positive definite matrix, of which only the lower triangle is read; it is overwritten."""
     n = len(x)
     for i in range(n):
@@ -95,7 +109,16 @@ def _solve(normal, x):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _respond(along, late, share, beyond, index, weight, part, error):  # type: ignore[no-untyped-def]
+def _respond(
+    along: Float32,
+    late: Float32,
+    share: Float64,
+    beyond: Bool,
+    index: Int64,
+    weight: Float64,
+    part: Float32,
+    error: Float32,
+) -> np.float32:
     """error [point] = share |response|; returns the largest beyond the main lobe.
 
     ``part`` [4, points] holds the sums of one slot and of all of them.
@@ -121,7 +144,7 @@ def _respond(along, late, share, beyond, index, weight, part, error):  # type: i
 
 
 @njit(inline="always")
-def _reweigh(error, beyond, largest, emphasis):  # type: ignore[no-untyped-def]
+def _reweigh(error: Float32, beyond: Bool, largest: np.float32, emphasis: Float32) -> None:
     """Emphasis of the points beyond the main lobe by their error, its mean kept."""
     before, after = 0.0, 0.0
     for p in range(len(error)):
@@ -141,25 +164,25 @@ def _reweigh(error, beyond, largest, emphasis):  # type: ignore[no-untyped-def]
     ),
     **OPTIONS,
 )
-def level_lobes(  # type: ignore[no-untyped-def]
-    step,
-    point,
-    beyond,
-    place,
-    index,
-    pair,
-    of,
-    main_lobe,
-    ridge,
-    level,
-    rounds,
-    along,
-    late,
-    line,
-    sums,
-    normal,
-    weight,
-):
+def level_lobes(
+    step: Float64,
+    point: Float64,
+    beyond: Bool,
+    place: Float64,
+    index: Int64,
+    pair: Int64,
+    of: Int64,
+    main_lobe: float,
+    ridge: float,
+    level: float,
+    rounds: int,
+    along: Float32,
+    late: Float32,
+    line: Float32,
+    sums: Float64,
+    normal: Float64,
+    weight: Float64,
+) -> float:
     """Real weights of the lowest maximum of |response| beyond the main lobe; ends early once it is below ``level``.
 
     A channel's response to point p has the phase place[0] step[0, p] + place[1] step[1, p].
@@ -195,7 +218,7 @@ def level_lobes(  # type: ignore[no-untyped-def]
         w /= w.sum()
         largest = _respond(along, late, share, beyond, index, w, part, error)
         if largest < lowest:
-            lowest = largest
+            lowest = largest  # type: ignore[assignment]
             _copy(w, best)
         if largest <= level:
             break

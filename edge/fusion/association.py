@@ -210,17 +210,15 @@ class Associator:
             self._weight = np.zeros(2 * candidates)
         assignment.weigh(
             *(self._order, split, self._common, self._level, self._source, _columns(horizontal), _columns(vertical)),
-            *(
-                horizontal.doppler_m_s,
-                vertical.doppler_m_s,
-                self._board_m,
-                self._up,
-                self._limits,
-                self._scales,
-                self._first,
-                self._start,
-                self._weight,
-            ),
+            horizontal.doppler_m_s,
+            vertical.doppler_m_s,
+            self._board_m,
+            self._up,
+            self._limits,
+            self._scales,
+            self._first,
+            self._start,
+            self._weight,
         )
         found = assignment.assign(
             *(self._order, split, total, self._first, self._start, self._weight, self._price, self._assignment),

@@ -15,12 +15,13 @@ import numpy as np
 from numba import float32, float64, int64, njit, types
 
 from edge.fusion.kernels_association import BINS, COLUMNS, POWER, REAL, UNMATCHED, WHOLE, judge
+from edge.kernels_arrays import Float32, Float64, Int64
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 
 @njit(int64(WHOLE, int64, int64, REAL, float64, WHOLE, WHOLE), **OPTIONS)
-def windows(order, split, total, common, gate_m, first, start):  # type: ignore[no-untyped-def]
+def windows(order: Int64, split: int, total: int, common: Float64, gate_m: float, first: Int64, start: Int64) -> int:
     """Candidates of every row.
 
     Args:
@@ -54,24 +55,24 @@ def windows(order, split, total, common, gate_m, first, start):  # type: ignore[
     ),
     **OPTIONS,
 )
-def weigh(  # type: ignore[no-untyped-def]
-    order,
-    split,
-    common,
-    level,
-    source,
-    horizontal,
-    vertical,
-    speed_h,
-    speed_v,
-    board,
-    up,
-    limits,
-    scales,
-    first,
-    start,
-    weight,
-):
+def weigh(
+    order: Int64,
+    split: int,
+    common: Float64,
+    level: Float64,
+    source: Int64,
+    horizontal: tuple[Float32, Float32, Float32],
+    vertical: tuple[Float32, Float32, Float32],
+    speed_h: Float32,
+    speed_v: Float32,
+    board: Float64,
+    up: Float64,
+    limits: Float64,
+    scales: Float64,
+    first: Int64,
+    start: Int64,
+    weight: Float64,
+) -> None:
     """Weight of every candidate: dr^2 / 2 sigma^2 + 2 ln cosh(dL / 2 s) + dv^2 / 2 sigma_v^2 - most, but never above 0.
 
     Args:
@@ -103,7 +104,9 @@ def weigh(  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _reach(j, through, distance_j, distance, way, done, reached, count):  # type: ignore[no-untyped-def]
+def _reach(
+    j: int, through: int, distance_j: float, distance: Float64, way: Int64, done: Int64, reached: Int64, count: int
+) -> int:
     """Note a path to column j if it is the shortest so far; returns how many columns were reached."""
     if done[j] == 0 and distance_j < distance[j]:
         if distance[j] == np.inf:
@@ -114,9 +117,20 @@ def _reach(j, through, distance_j, distance, way, done, reached, count):  # type
 
 
 @njit(types.void(int64, int64, WHOLE, WHOLE, REAL, REAL, REAL, REAL, WHOLE, WHOLE, WHOLE, WHOLE), **OPTIONS)
-def insert(  # type: ignore[no-untyped-def]
-    row, columns, first, start, weight, row_price, column_price, distance, owner, way, done, reached
-):
+def insert(
+    row: int,
+    columns: int,
+    first: Int64,
+    start: Int64,
+    weight: Float64,
+    row_price: Float64,
+    column_price: Float64,
+    distance: Float64,
+    owner: Int64,
+    way: Int64,
+    done: Int64,
+    reached: Int64,
+) -> None:
     """Give one more row a column along the shortest augmenting path (Dijkstra on reduced weights).
 
     Args:
@@ -167,7 +181,18 @@ def insert(  # type: ignore[no-untyped-def]
     ),
     **OPTIONS,
 )
-def assign(order, split, total, first, start, weight, price, scratch, pairs, counts):  # type: ignore[no-untyped-def]
+def assign(
+    order: Int64,
+    split: int,
+    total: int,
+    first: Int64,
+    start: Int64,
+    weight: Float64,
+    price: Float64,
+    scratch: Int64,
+    pairs: Int64,
+    counts: Int64,
+) -> int:
     """Pairs of the one-to-one assignment with the least sum of weights (Hungarian method, shortest augmenting paths).
 
     Only columns that a path reaches are looked at: the work grows with the crowd in a range bin, not with the frame.

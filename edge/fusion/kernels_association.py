@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, types
 
+from edge.kernels_arrays import Float32, Float64, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 INVALID, FOV, SIDELOBE, BINS, UNMATCHED, POWER, PAIRS, GEOMETRY, GROUND, HEIGHT, POINTS = range(11)
@@ -22,14 +24,14 @@ REAL, WHOLE = float64[::1], int64[::1]
 
 
 @njit(inline="always")
-def _loss_db(cosine, pattern):  # type: ignore[no-untyped-def]
+def _loss_db(cosine: float, pattern: Float64) -> float:
     """One-way loss across the array at a direction cosine; pattern: edge in degrees, loss there, most."""
     angle_deg = np.degrees(np.arcsin(min(max(cosine, -1.0), 1.0)))
-    return min(pattern[1] * (angle_deg / pattern[0]) ** 2, pattern[2])
+    return min(pattern[1] * (angle_deg / pattern[0]) ** 2, pattern[2])  # type: ignore[no-any-return]
 
 
 @njit(inline="always")
-def _is_sidelobe(n, range_m, power_db, sidelobe):  # type: ignore[no-untyped-def]
+def _is_sidelobe(n: int, range_m: Float32, power_db: Float32, sidelobe: Float64) -> bool:
     """Whether some detection at the same range is stronger by more than sidelobe[0] dB; the same: sidelobe[1] m."""
     r, enough_db = float64(range_m[n]), float64(power_db[n]) + sidelobe[0]
     for m in range(len(range_m)):
@@ -39,9 +41,18 @@ def _is_sidelobe(n, range_m, power_db, sidelobe):  # type: ignore[no-untyped-def
 
 
 @njit(int64(COLUMNS, REAL, REAL, float64, REAL, int64, WHOLE, REAL, REAL, WHOLE), **OPTIONS)
-def describe(  # type: ignore[no-untyped-def]
-    columns, board, pattern, sine_fov, sidelobe, start, source, common, level, counts
-):
+def describe(
+    columns: tuple[Float32, Float32, Float32],
+    board: Float64,
+    pattern: Float64,
+    sine_fov: float,
+    sidelobe: Float64,
+    start: int,
+    source: Int64,
+    common: Float64,
+    level: Float64,
+    counts: Int64,
+) -> int:
     """One radar's detections: keep the main lobes in the field of view and give what both radars can compare.
 
     Args:
@@ -80,17 +91,17 @@ def describe(  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _before(i, j, key, tie):  # type: ignore[no-untyped-def]
+def _before(i: int, j: int, key: Float64, tie: Float64) -> bool:
     """Whether i sorts before j: by key, then tie, then index."""
     if key[i] != key[j]:
-        return key[i] < key[j]
+        return key[i] < key[j]  # type: ignore[no-any-return]
     if tie[i] != tie[j]:
-        return tie[i] < tie[j]
+        return tie[i] < tie[j]  # type: ignore[no-any-return]
     return i < j
 
 
 @njit(types.void(WHOLE, int64, int64, REAL, REAL), **OPTIONS)
-def sort(order, first, last, key, tie):  # type: ignore[no-untyped-def]
+def sort(order: Int64, first: int, last: int, key: Float64, tie: Float64) -> None:
     """Heap sort of ``order[first:last]`` by key, then tie, then index, ascending."""
     size = last - first
     for step in range(size // 2 + size):
@@ -109,7 +120,7 @@ def sort(order, first, last, key, tie):  # type: ignore[no-untyped-def]
 
 
 @njit(types.void(WHOLE, int64, int64, int64[:, ::1], int64[:, ::1]), **OPTIONS)
-def neighbours(order, total, split, previous, following):  # type: ignore[no-untyped-def]
+def neighbours(order: Int64, total: int, split: int, previous: Int64, following: Int64) -> None:
     """For every place in range order: the nearest place of each radar at or before it, and at or after it.
 
     Args:
@@ -134,13 +145,13 @@ def neighbours(order, total, split, previous, following):  # type: ignore[no-unt
 
 
 @njit(boolean(WHOLE, REAL, int64, int64, int64, int64, float64), **OPTIONS)
-def _linked(order, common, before, after, first, last, gate_m):  # type: ignore[no-untyped-def]
+def _linked(order: Int64, common: Float64, before: int, after: int, first: int, last: int, gate_m: float) -> bool:
     """Whether the places exist inside first..last and differ by the gate at most."""
     return before >= first and after < last and common[order[after]] - common[order[before]] <= gate_m
 
 
 @njit(int64(WHOLE, REAL, int64, int64, float64, int64[:, ::1], int64[:, ::1]), **OPTIONS)
-def cut(order, common, first, last, gate_m, previous, following):  # type: ignore[no-untyped-def]
+def cut(order: Int64, common: Float64, first: int, last: int, gate_m: float, previous: Int64, following: Int64) -> int:
     """Where places first..last must be cut: the second part's first place, or ``last`` when they are one range bin.
 
     A gap that no pair within the gate spans is cut; failing that, when some pair exceeds the gate, the widest gap is.
@@ -162,7 +173,17 @@ def cut(order, common, first, last, gate_m, previous, following):  # type: ignor
 
 
 @njit(int64(WHOLE, REAL, int64, int64, float64, int64[:, ::1], int64[:, ::1], WHOLE, WHOLE), **OPTIONS)
-def divide(order, common, total, split, gate_m, previous, following, stack, bound):  # type: ignore[no-untyped-def]
+def divide(
+    order: Int64,
+    common: Float64,
+    total: int,
+    split: int,
+    gate_m: float,
+    previous: Int64,
+    following: Int64,
+    stack: Int64,
+    bound: Int64,
+) -> int:
     """Divide all detections into range bins whose members of different radars all lie within the gate.
 
     Args:
@@ -194,7 +215,7 @@ def divide(order, common, total, split, gate_m, previous, following, stack, boun
 
 
 @njit(int64(WHOLE, int64, int64, int64, WHOLE), **OPTIONS)
-def partition(order, first, last, split, scratch):  # type: ignore[no-untyped-def]
+def partition(order: Int64, first: int, last: int, split: int, scratch: Int64) -> int:
     """Move the horizontal radar's detections in front, keeping the order; returns the vertical ones' first place."""
     middle, others = first, 0
     for k in range(first, last):
@@ -210,7 +231,19 @@ def partition(order, first, last, split, scratch):  # type: ignore[no-untyped-de
 
 
 @njit(int64(WHOLE, REAL, REAL, int64, int64, WHOLE, float64, REAL, WHOLE, int64[:, ::1], WHOLE), **OPTIONS)
-def pair(order, common, level, split, bins, bound, max_db, key, scratch, pairs, counts):  # type: ignore[no-untyped-def]
+def pair(
+    order: Int64,
+    common: Float64,
+    level: Float64,
+    split: int,
+    bins: int,
+    bound: Int64,
+    max_db: float,
+    key: Float64,
+    scratch: Int64,
+    pairs: Int64,
+    counts: Int64,
+) -> int:
     """Pair inside every range bin: by rank of level; unequal counts stop at the first discrepancy beyond ``max_db``.
 
     Args:
@@ -248,7 +281,7 @@ def pair(order, common, level, split, bins, bound, max_db, key, scratch, pairs, 
 
 
 @njit(inline="always")
-def _locate(r_h, u, r_v, w, board):  # type: ignore[no-untyped-def]
+def _locate(r_h: float, u: float, r_v: float, w: float, board: Float64) -> tuple[bool, float, float, float]:
     """Whether a point is seen at (r_h, u) by the horizontal and at (r_v, w) by the vertical radar, and its x, y, z.
 
     With a, b the boards: y = a_y + r_h u and z = b_z + r_v w are exact; x is the mean of the two solutions
@@ -263,7 +296,9 @@ def _locate(r_h, u, r_v, w, board):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def judge(r_h, u, r_v, w, board, up, limits):  # type: ignore[no-untyped-def]
+def judge(
+    r_h: float, u: float, r_v: float, w: float, board: Float64, up: Float64, limits: Float64
+) -> tuple[int, float, float, float]:
     """Why a pair is no point of the kept region (GEOMETRY, GROUND or HEIGHT; -1: it is one), and its x, y, z.
 
     Args:
@@ -291,9 +326,21 @@ def judge(r_h, u, r_v, w, board, up, limits):  # type: ignore[no-untyped-def]
     ),
     **OPTIONS,
 )
-def solve(  # type: ignore[no-untyped-def]
-    pairs, found, source, horizontal, vertical, board, offset_db, pattern, up, limits, xyz, out, counts
-):
+def solve(
+    pairs: Int64,
+    found: int,
+    source: Int64,
+    horizontal: tuple[Float32, Float32, Float32],
+    vertical: tuple[Float32, Float32, Float32],
+    board: Float64,
+    offset_db: Float64,
+    pattern: Float64,
+    up: Float64,
+    limits: Float64,
+    xyz: Float32,
+    out: Float32,
+    counts: Int64,
+) -> int:
     """Place the pairs in space and keep those between ground and largest height.
 
     Args:

@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from edge.kernels_arrays import Float64, Int32, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "cache": True}
 CELL_SHARE = (1.0 - 1e-6) / np.sqrt(2.0)  # cell side / radius: rounding cannot put one cell's points out of reach
 REACH = 2  # cells to either side that a neighbourhood can touch
@@ -59,7 +61,7 @@ def make_grid(capacity: int) -> Grid:
 
 
 @njit(**OPTIONS)
-def _slot(grid, ix, iy):  # type: ignore[no-untyped-def]
+def _slot(grid: Grid, ix: int, iy: int) -> int:
     """Hash slot that holds cell (ix, iy), or the free one where it belongs (Teschner et al. 2003, linear probing)."""
     mask = len(grid.table) - 1
     slot = ((ix * 73856093) ^ (iy * 19349663)) & mask
@@ -71,7 +73,7 @@ def _slot(grid, ix, iy):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def build_grid(xy, side, grid):  # type: ignore[no-untyped-def]
+def build_grid(xy: Float64, side: float, grid: Grid) -> int:
     """Sort points into cells.
 
     Args:
@@ -106,7 +108,7 @@ def build_grid(xy, side, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _mark_core(xy, radius2, core_points, cells, grid):  # type: ignore[no-untyped-def]
+def _mark_core(xy: Float64, radius2: float, core_points: int, cells: int, grid: Grid) -> None:
     """Find the core points."""
     for cell in range(cells):
         start, end = grid.first[cell], grid.first[cell + 1]
@@ -128,7 +130,7 @@ def _mark_core(xy, radius2, core_points, cells, grid):  # type: ignore[no-untype
 
 
 @njit(**OPTIONS)
-def _bound(xy, grid):  # type: ignore[no-untyped-def]
+def _bound(xy: Float64, grid: Grid) -> None:
     """Bounds of every cell's points that count."""
     n = len(xy)
     grid.box[:n, 0::2], grid.box[:n, 1::2] = np.inf, -np.inf
@@ -141,7 +143,7 @@ def _bound(xy, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _root(parent, cell):  # type: ignore[no-untyped-def]
+def _root(parent: Int32, cell: int) -> int:
     """Representative of a cell's cluster, halving the path."""
     while parent[cell] != cell:
         parent[cell] = parent[parent[cell]]
@@ -150,7 +152,7 @@ def _root(parent, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _touch(xy, a, b, radius2, grid):  # type: ignore[no-untyped-def]
+def _touch(xy: Float64, a: int, b: int, radius2: float, grid: Grid) -> bool:
     """Whether a core point of cell a and one of cell b are neighbours."""
     gap2 = 0.0
     for axis in range(2):
@@ -172,7 +174,7 @@ def _touch(xy, a, b, radius2, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _join(xy, radius2, cells, grid):  # type: ignore[no-untyped-def]
+def _join(xy: Float64, radius2: float, cells: int, grid: Grid) -> None:
     """Unite the cells whose core points are neighbours."""
     for cell in range(cells):
         grid.parent[cell] = cell
@@ -190,7 +192,7 @@ def _join(xy, radius2, cells, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def dbscan(xy, radius, core_points, grid, labels):  # type: ignore[no-untyped-def]
+def dbscan(xy: Float64, radius: float, core_points: int, grid: Grid, labels: Int32) -> int:
     """Label points by density, as ``edge.reference.clustering.dbscan`` defines it.
 
     Args:
@@ -224,7 +226,7 @@ def dbscan(xy, radius, core_points, grid, labels):  # type: ignore[no-untyped-de
 
 
 @njit(**OPTIONS)
-def _nearest(x, y, xy, radius, grid):  # type: ignore[no-untyped-def]
+def _nearest(x: float, y: float, xy: Float64, radius: float, grid: Grid) -> int:
     """Nearest point that counts within ``radius`` of (x, y), the first of equally near ones; -1 when there is none.
 
     Cells whose bounds are farther than the best so far are passed over; rounding is monotonic, so none is missed.
@@ -254,7 +256,7 @@ def _nearest(x, y, xy, radius, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def nearest_labels(query, xy, radius, grid, labels, found):  # type: ignore[no-untyped-def]
+def nearest_labels(query: Float64, xy: Float64, radius: float, grid: Grid, labels: Int32, found: Int32) -> None:
     """Label of the nearest labelled point within ``radius`` of each query point.
 
     Args:
@@ -272,7 +274,7 @@ def nearest_labels(query, xy, radius, grid, labels, found):  # type: ignore[no-u
 
 
 @njit(**OPTIONS)
-def measure(xy, labels, direction, count, span, extent):  # type: ignore[no-untyped-def]
+def measure(xy: Float64, labels: Int32, direction: Float64, count: Int64, span: Float64, extent: Float64) -> None:
     """Size of every cluster.
 
     Args:

@@ -11,6 +11,8 @@ from typing import Any
 
 from numba import float32, float64, int64, njit, types
 
+from edge.kernels_arrays import Float32, Float64, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 
@@ -21,7 +23,17 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck":
     ),
     **OPTIONS,
 )
-def store(xyz, power, number, rotation, origin, head, ring_xyz, ring_power, ring_number):  # type: ignore[no-untyped-def]
+def store(
+    xyz: Float32,
+    power: Float32,
+    number: int,
+    rotation: Float64,
+    origin: Float64,
+    head: int,
+    ring_xyz: Float64,
+    ring_power: Float32,
+    ring_number: Int64,
+) -> int:
     """Append a frame's points; of a frame larger than the ring only the last ones stay.
 
     Args:
@@ -52,7 +64,17 @@ def store(xyz, power, number, rotation, origin, head, ring_xyz, ring_power, ring
     ),
     **OPTIONS,
 )
-def read(ring_xyz, ring_power, ring_number, first, rotation, origin, xyz, power, number):  # type: ignore[no-untyped-def]
+def read(
+    ring_xyz: Float64,
+    ring_power: Float32,
+    ring_number: Int64,
+    first: int,
+    rotation: Float64,
+    origin: Float64,
+    xyz: Float32,
+    power: Float32,
+    number: Int64,
+) -> None:
     """Copy points out of the ring, seen from a pose.
 
     Args:

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import int32, int64, njit, types, uint8, uint16, uint32
+
+from edge.kernels_arrays import Int32, Int64, UInt8, UInt16, UInt32
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 P = 1456
@@ -30,19 +33,19 @@ COUNTERS = 15
 
 
 @njit(inline="always", **OPTIONS)
-def _little(row, place, size):  # type: ignore[no-untyped-def]
+def _little(row: UInt8, place: int, size: int) -> int:
     """Little-endian unsigned integer of up to 8 bytes."""
     value = int64(0)
     for k in range(size):
         value |= int64(row[place + k]) << (8 * k)
-    return value
+    return value  # type: ignore[return-value]
 
 
 @njit(
     types.void(uint8[:, ::1], int64[::1], int64, int64, int64[::1], int64[::1]),
     **OPTIONS,
 )
-def read_control(control, lengths, count, shift_ns, stamps, drops):  # type: ignore[no-untyped-def]
+def read_control(control: UInt8, lengths: Int64, count: int, shift_ns: int, stamps: Int64, drops: Int64) -> None:
     """Arrival times and the kernel's count of dropped packets, from the control messages of a batch.
 
     Args:
@@ -75,10 +78,9 @@ def read_control(control, lengths, count, shift_ns, stamps, drops):  # type: ign
     ),
     **OPTIONS,
 )
-def place(  # type: ignore[no-untyped-def]
-    packets, sizes, senders, stamps, first, count, sender, reorder, start_slots,
-    state, counters, ring, got, received, arrival,
-):  # fmt: skip
+def place(packets: UInt8, sizes: Int32, senders: UInt32, stamps: Int64, first: int, count: int, sender: np.uint32,
+          reorder: int, start_slots: int, state: Int64, counters: Int64, ring: UInt8, got: UInt16, received: Int64,
+          arrival: Int64) -> int:  # fmt: skip
     """Copy packets of a batch to their frames, until the oldest open frame must be closed or the batch ends.
 
     Args:
