@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numba import float32, int16, int32, njit, uint32, uint64
 
+from edge.kernels_arrays import Float32, Int16
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 _LOW = np.uint64(0xFFFFFFFF)
@@ -29,7 +31,9 @@ _EXPONENT, _BIAS = np.int32(23), np.int32(127)
 
 
 @njit(inline="always")
-def _philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
+def _philox(
+    c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
+) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
     """Four random words of 32 bits, each in a uint64, from a counter of four words and a key of two."""
     for _ in range(_ROUNDS):
         a, b = c0 * _MULTIPLIER_0, c2 * _MULTIPLIER_1
@@ -40,7 +44,7 @@ def _philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _word(place, first, second):  # type: ignore[no-untyped-def]
+def _word(place: int, first: np.uint32, second: np.uint32) -> np.uint32:
     """Random uint32 of a place and a key of two words."""
     x = uint32(uint32(place) * _GOLDEN + first)
     x = uint32((x ^ uint32(x >> _16)) * _FIRST) ^ second
@@ -49,7 +53,7 @@ def _word(place, first, second):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _two_normals(word):  # type: ignore[no-untyped-def]
+def _two_normals(word: np.uint32) -> tuple[np.float32, np.float32]:
     """Two independent standard normal numbers of a random word; least-squares polynomials, errors below 1e-3."""
     u = (float32(int32(word >> _16)) + float32(0.5)) * float32(2.0**-16)
     bits = np.float32(u).view(np.int32)
@@ -68,13 +72,21 @@ def _two_normals(word):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _code(value):  # type: ignore[no-untyped-def]
+def _code(value: np.float32) -> np.int16:
     """Nearest int16, clipped."""
-    return int16(np.floor(min(max(value, float32(-32768.0)), float32(32767.0)) + float32(0.5)))
+    return int16(np.floor(min(max(value, float32(-32768.0)), float32(32767.0)) + float32(0.5)))  # type: ignore[return-value]
 
 
 @njit(**OPTIONS)
-def digitise(signal, deviation, key_low, key_high, frame, loop, adc):  # type: ignore[no-untyped-def]
+def digitise(
+    signal: Float32,
+    deviation: Float32,
+    key_low: np.uint64,
+    key_high: np.uint64,
+    frame: np.uint64,
+    loop: int,
+    adc: Int16,
+) -> None:
     """Signal plus noise as ADC codes, in the order of the capture.
 
     Args:

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numba import float32, int32, njit, uint64
 
+from edge.kernels_arrays import Float32, Float64, Int32
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 RX = 4
@@ -30,13 +32,13 @@ BLOCK = 128
 
 
 @njit(inline="always")
-def phasor(turns):  # type: ignore[no-untyped-def]
+def phasor(turns: float) -> tuple[np.float32, np.float32]:
     """Cosine and sine of 2 pi turns: float64 in, float32 out."""
     return _circle(float32(turns - np.floor(turns + 0.5)))
 
 
 @njit(inline="always")
-def _circle(r):  # type: ignore[no-untyped-def]
+def _circle(r: np.float32) -> tuple[np.float32, np.float32]:
     """Cosine and sine of 2 pi r, |r| <= 1/2: error 4e-7; least-squares polynomials of the half."""
     t = r * r
     sine = float32(0.0820504019) - float32(0.00702838654) * t
@@ -49,7 +51,7 @@ def _circle(r):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def exponential(y):  # type: ignore[no-untyped-def]
+def exponential(y: np.float32) -> np.float32:
     """exp(y) for |y| < 1.1: Taylor to y^9, error 7e-7 at the ends."""
     p = float32(1 / 5040) + y * (float32(1 / 40320) + y * float32(1 / 362880))
     p = float32(1 / 24) + y * (float32(1 / 120) + y * (float32(1 / 720) + y * p))
@@ -58,7 +60,9 @@ def exponential(y):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _paths(first, size, points, velocity, antenna, t, path, row):  # type: ignore[no-untyped-def]
+def _paths(
+    first: int, size: np.uint64, points: Float64, velocity: Float64, antenna: Float64, t: float, path: Float64, row: int
+) -> None:
     """Distances of a block's scatterers to one antenna at time ``t``.
 
     One array is written in a loop of its own here and below: more would need too many checks for overlaps, and the loop
@@ -74,7 +78,9 @@ def _paths(first, size, points, velocity, antenna, t, path, row):  # type: ignor
 
 
 @njit(inline="always")
-def _extend(first, size, path, row, new, shortest, longest):  # type: ignore[no-untyped-def]
+def _extend(
+    first: int, size: np.uint64, path: Float64, row: int, new: bool, shortest: Float64, longest: Float64
+) -> None:
     """Shortest and longest legs, ``new``: of the first antenna."""
     begin = uint64(first)
     for i in range(uint64(size)):
@@ -86,9 +92,9 @@ def _extend(first, size, path, row, new, shortest, longest):  # type: ignore[no-
 
 
 @njit(**OPTIONS)
-def station_paths(  # type: ignore[no-untyped-def]
-    count, points, velocity, bend, stations, timing, later_s2, scale, table, base, shortest, longest, path
-):
+def station_paths(count: int, points: Float64, velocity: Float64, bend: Float64, stations: Float64, timing: Float64,
+                  later_s2: Float64, scale: Float64, table: Float32, base: Int32, shortest: Float64, longest: Float64,
+                  path: Float64) -> None:  # fmt: skip
     """Paths to every station at the first instant, and as parabolas of x from 0 to 1 what they change over the burst.
 
     Args:
@@ -138,7 +144,7 @@ def station_paths(  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _waves(size, part, wave):  # type: ignore[no-untyped-def]
+def _waves(size: np.uint64, part: Float32, wave: Float32) -> None:
     """Cosines, and ``BLOCK`` further on sines, of turns."""
     for i in range(size):
         part[i] -= np.floor(part[i] + float32(0.5))
@@ -147,7 +153,8 @@ def _waves(size, part, wave):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def transmit_legs(count, table, base, x, amplitude, scale, re, im, cell, part, wave):  # type: ignore[no-untyped-def]
+def transmit_legs(count: int, table: Float32, base: Int32, x: np.float32, amplitude: Float32, scale: Float32,
+                  re: Float32, im: Float32, cell: Float32, part: Float32, wave: Float32) -> None:  # fmt: skip
     """Amplitude times transmit phasor and place on the grid of every slot of one loop.
 
     Args:
@@ -182,7 +189,7 @@ def transmit_legs(count, table, base, x, amplitude, scale, re, im, cell, part, w
 
 
 @njit(inline="always")
-def _store(first, size, wave, room, phasors):  # type: ignore[no-untyped-def]
+def _store(first: int, size: np.uint64, wave: Float32, room: np.uint64, phasors: Float32) -> None:
     """A block's cosines, and sines ``room`` further on."""
     for i in range(size):
         phasors[first + i] = wave[i]
@@ -191,7 +198,8 @@ def _store(first, size, wave, room, phasors):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def chip_legs(count, table, x, step, slots, cells_per_turn, swing, swing_step, cell, part, wave):  # type: ignore[no-untyped-def]
+def chip_legs(count: int, table: Float32, x: np.float32, step: np.float32, slots: int, cells_per_turn: np.float32,
+              swing: Float32, swing_step: Float32, cell: Float32, part: Float32, wave: Float32) -> None:  # fmt: skip
     """Phasors of the chips' middles at slot 0 of one loop, how they turn from slot to slot, and places on the grid.
 
     Args:
@@ -230,7 +238,9 @@ def chip_legs(count, table, x, step, slots, cells_per_turn, swing, swing_step, c
 
 
 @njit(inline="always")
-def _rates(first, size, points, velocity, antenna, t, path, n):  # type: ignore[no-untyped-def]
+def _rates(
+    first: int, size: np.uint64, points: Float64, velocity: Float64, antenna: Float64, t: float, path: Float64, n: int
+) -> None:
     """Change per second of the distances to receiver n."""
     for i in range(size):
         k = first + i
@@ -242,7 +252,7 @@ def _rates(first, size, points, velocity, antenna, t, path, n):  # type: ignore[
 
 
 @njit(inline="always")
-def _from_middle(size, path, row, apart):  # type: ignore[no-untyped-def]
+def _from_middle(size: np.uint64, path: Float64, row: np.uint64, apart: Float64) -> None:
     """What the group's four rows from ``row`` on have more than the row after them, [scatterer, RX]."""
     for i in range(size):
         for n in range(uint64(RX)):
@@ -250,7 +260,8 @@ def _from_middle(size, path, row, apart):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _weigh(size, apart, rate, scale, back_s, shape, edge, work):  # type: ignore[no-untyped-def]
+def _weigh(size: np.uint64, apart: Float64, rate: Float64, scale: Float64, back_s: float, shape: np.float32,
+           edge: np.float32, work: Float32) -> None:  # fmt: skip
     """Place in the group, weighted cosine and sine in the first run, exp(b place), exp(-b place): all receivers."""
     away, cosine, sine, rise, fall = work[0], work[1], work[2], work[3], work[4]
     for i in range(size):
@@ -272,7 +283,7 @@ def _weigh(size, apart, rate, scale, back_s, shape, edge, work):  # type: ignore
 
 
 @njit(inline="always")
-def _write_legs(legs, first, size, work, b, factors):  # type: ignore[no-untyped-def]
+def _write_legs(legs: Float32, first: int, size: np.uint64, work: Float32, b: np.float32, factors: Float32) -> None:
     """Lanes of a block of scatterers from what ``_weigh`` found."""
     span, rx = uint64(len(legs) // LEG_PLANES), uint64(RX)
     away, cosine, sine, rise, fall = work[0], work[1], work[2], work[3], work[4]
@@ -291,7 +302,7 @@ def _write_legs(legs, first, size, work, b, factors):  # type: ignore[no-untyped
 
 
 @njit(inline="always")
-def _write_turns(turn, first, size, rate, turns_per_m, work):  # type: ignore[no-untyped-def]
+def _write_turns(turn: Float32, first: int, size: np.uint64, rate: Float64, turns_per_m: float, work: Float32) -> None:
     """Cosines and sines of the turn per run, in the order of the legs' lanes."""
     span, rx = uint64(len(turn) // 2), uint64(RX)
     part, cosine, sine = work[0], work[1], work[2]
@@ -309,25 +320,10 @@ def _write_turns(turn, first, size, rate, turns_per_m, work):  # type: ignore[no
 
 
 @njit(**OPTIONS)
-def receive_legs(  # type: ignore[no-untyped-def]
-    count,
-    points,
-    velocity,
-    antennas,
-    middles,
-    scale,
-    timing,
-    shape,
-    edge,
-    factors,
-    legs,
-    turn,
-    shortest,
-    longest,
-    path,
-    apart,
-    work,
-):
+def receive_legs(count: int, points: Float64, velocity: Float64, antennas: Float64, middles: Float64, scale: Float64,
+                 timing: Float64, shape: np.float32, edge: np.float32, factors: Float32, legs: Float32, turn: Float32,
+                 shortest: Float64, longest: Float64, path: Float64, apart: Float64,
+                 work: Float32) -> None:  # fmt: skip
     """Phasors of every receiver from the middle of its chip with their share of the weights, and how they turn.
 
     Args:

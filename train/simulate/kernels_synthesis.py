@@ -20,11 +20,12 @@ from functools import cache
 import numpy as np
 from numba import float32, int32, njit, uint64
 
+from edge.kernels_arrays import Complex64, Float32, Float64, Int32
 from train.simulate.kernels_legs import LANES, LEG_PLANES, OPTIONS, RX, exponential
 
 
 @njit(inline="always")
-def _short_exponential(y):  # type: ignore[no-untyped-def]
+def _short_exponential(y: np.float32) -> np.float32:
     """exp(y) for |y| < 0.96, error 2.3e-6: least squares of the relative error, reweighted to level it."""
     p = float32(0.0417559088) + y * (float32(0.00864033939) + y * float32(0.00134940962))
     p = float32(0.499966318) + y * (float32(0.166536757) + y * p)
@@ -32,7 +33,16 @@ def _short_exponential(y):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def filter_amplitudes(count, points, amplitude, centre_m, cells_per_m, offset_m, table, filtered):  # type: ignore[no-untyped-def]
+def filter_amplitudes(
+    count: int,
+    points: Float64,
+    amplitude: Complex64,
+    centre_m: Float64,
+    cells_per_m: float,
+    offset_m: float,
+    table: Complex64,
+    filtered: Float32,
+) -> None:
     """Amplitudes times the receiver's response at each scatterer's beat frequency, as (re, im) rows.
 
     Args:
@@ -58,7 +68,23 @@ def filter_amplitudes(count, points, amplitude, centre_m, cells_per_m, offset_m,
 
 
 @njit(inline="always")
-def _plan(count, re, im, cell_out, mean, rate, late, turned, base, width, b, outer, first_ratio, plan, start):  # type: ignore[no-untyped-def]
+def _plan(
+    count: int,
+    re: Float32,
+    im: Float32,
+    cell_out: Float32,
+    mean: Float32,
+    rate: Float32,
+    late: np.float32,
+    turned: Float32,
+    base: Int32,
+    width: int,
+    b: np.float32,
+    outer: np.float32,
+    first_ratio: np.float32,
+    plan: Float32,
+    start: Int32,
+) -> None:
     """First cell of every scatterer, place from its middle, and what it brings to the weights of one group."""
     room = len(turned) // 2
     for k in range(count):
@@ -78,7 +104,7 @@ def _plan(count, re, im, cell_out, mean, rate, late, turned, base, width, b, out
 
 
 @njit(inline="always")
-def _turn(size, span, state, turn):  # type: ignore[no-untyped-def]
+def _turn(size: np.uint64, span: np.uint64, state: Float32, turn: Float32) -> None:
     """Turn phasors (re, then im from ``span`` on): one flat loop, which vectorises."""
     for x in range(size):
         re, im = state[x], state[x + span]
@@ -87,7 +113,20 @@ def _turn(size, span, state, turn):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _add(count, span, legs, plan, start, short, steps, lanes, imaginary, bend, begin, grid):  # type: ignore[no-untyped-def]
+def _add(
+    count: int,
+    span: np.uint64,
+    legs: Float32,
+    plan: Float32,
+    start: Int32,
+    short: bool,
+    steps: np.uint64,
+    lanes: np.uint64,
+    imaginary: np.uint64,
+    bend: np.float32,
+    begin: np.uint64,
+    grid: Float32,
+) -> None:
     """Add all scatterers to one group's grid, ``steps`` times four cells each."""
     for k in range(uint64(count)):
         away, a, c, ratio = plan[0, k], plan[1, k], plan[2, k], plan[3, k]
@@ -128,9 +167,23 @@ def spreader(width: int, shape: float, plane: int) -> Callable[..., None]:
     bend = np.float32(math.exp(-32.0 * shape))
 
     @njit(**OPTIONS)
-    def spread(  # type: ignore[no-untyped-def]
-        count, re_out, im_out, cell_out, cell_back, base, swing, swing_step, legs, turn, run, onward, plan, start, grid
-    ):
+    def spread(
+        count: int,
+        re_out: Float32,
+        im_out: Float32,
+        cell_out: Float32,
+        cell_back: Float32,
+        base: Int32,
+        swing: Float32,
+        swing_step: Float32,
+        legs: Float32,
+        turn: Float32,
+        run: int,
+        onward: bool,
+        plan: Float32,
+        start: Int32,
+        grid: Float32,
+    ) -> None:
         slots, begin, room = len(re_out), uint64(0), uint64(swing.shape[1] // 2)
         for chip in range(len(legs)):
             table, turns, span = legs[chip], turn[chip], uint64(legs.shape[1] // LEG_PLANES)

@@ -17,6 +17,8 @@ import numpy as np
 from numba import complex128, njit, uint64
 from numpy.typing import NDArray
 
+from edge.kernels_arrays import Complex128, Float32, Int64
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy", "boundscheck": False, "cache": True}
 
 RX = 4
@@ -51,7 +53,18 @@ def row_of_block(cells: int) -> NDArray[np.int64]:
 
 
 @njit(inline="always")
-def _butterfly(work, x, q, im, w1r, w1i, w2r, w2i, w3r, w3i):  # type: ignore[no-untyped-def]
+def _butterfly(
+    work: Float32,
+    x: np.uint64,
+    q: np.uint64,
+    im: np.uint64,
+    w1r: np.float32,
+    w1i: np.float32,
+    w2r: np.float32,
+    w2i: np.float32,
+    w3r: np.float32,
+    w3i: np.float32,
+) -> None:
     """Radix-4 butterfly of the inverse transform on work[x + {0, q, 2q, 3q}], then the twiddles."""
     ar, ai = work[x], work[x + im]
     br, bi = work[x + q], work[x + q + im]
@@ -69,7 +82,9 @@ def _butterfly(work, x, q, im, w1r, w1i, w2r, w2i, w3r, w3i):  # type: ignore[no
 
 
 @njit(inline="always")
-def _wide_stage(work, begin, twiddle, first, groups, q, im):  # type: ignore[no-untyped-def]
+def _wide_stage(
+    work: Float32, begin: np.uint64, twiddle: Float32, first: np.uint64, groups: np.uint64, q: np.uint64, im: np.uint64
+) -> None:
     """Stage over ``q`` = quarter x receivers contiguous lanes, twiddles expanded to the lanes."""
     two = q + q
     for g in range(groups):
@@ -82,7 +97,15 @@ def _wide_stage(work, begin, twiddle, first, groups, q, im):  # type: ignore[no-
 
 
 @njit(inline="always")
-def _narrow_stage(work, twiddle, first, groups, quarter, lanes, im):  # type: ignore[no-untyped-def]
+def _narrow_stage(
+    work: Float32,
+    twiddle: Float32,
+    first: np.uint64,
+    groups: np.uint64,
+    quarter: np.uint64,
+    lanes: np.uint64,
+    im: np.uint64,
+) -> None:
     """Stage whose inner loop runs over the parts and receivers; twiddles are scalars."""
     for g in range(groups):
         for p in range(quarter):
@@ -95,7 +118,7 @@ def _narrow_stage(work, twiddle, first, groups, quarter, lanes, im):  # type: ig
 
 
 @njit(inline="always")
-def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
+def _pair_stage(work: Float32, groups: np.uint64, lanes: np.uint64, im: np.uint64) -> None:
     """Final radix-2 stage of lengths 2 * 4^k."""
     for g in range(groups):
         for lane in range(lanes):
@@ -107,7 +130,7 @@ def _pair_stage(work, groups, lanes, im):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _change_places(grid, begin, plane, rest, work):  # type: ignore[no-untyped-def]
+def _change_places(grid: Complex128, begin: np.uint64, plane: np.uint64, rest: np.uint64, work: Complex128) -> None:
     """Rows of every part side by side, lower digit of the sample first: complex128 moves four receivers at once."""
     for p in range(uint64(2)):
         for low in range(uint64(4)):
@@ -138,8 +161,17 @@ def transformer(cells: int, samples: int, margin: int) -> Callable[..., None]:
     before, blocks, points = samples // (2 * PARTS), -(-samples // PARTS), np.uint64(samples * RX)
 
     @njit(**OPTIONS)
-    def transform(grid, twiddle, row_of, work, correction, response, leakage, signal):  # type: ignore[no-untyped-def]
-        packed, packed_work = grid.view(complex128), work.view(complex128)
+    def transform(
+        grid: Float32,
+        twiddle: Float32,
+        row_of: Int64,
+        work: Float32,
+        correction: Float32,
+        response: Float32,
+        leakage: Float32,
+        signal: Float32,
+    ) -> None:
+        packed, packed_work = grid.view(complex128), work.view(complex128)  # type: ignore[call-overload]
         for g in range(uint64(len(grid)) // (plane + plane)):
             begin = g * (plane + plane)
             for p in range(uint64(2)):
