@@ -11,7 +11,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 from edge.errors import ExitCode, RfconstructError
@@ -47,22 +47,61 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be text
+    return survived(" ".join(["rfconstruct", *arguments[:1]]), lambda: _dispatch(arguments))
+
+
+def survived(program: str, work: Callable[[], int]) -> int:
+    """Do the work of a command: Ctrl-C, a reader that went away and what the system refuses are no tracebacks.
+
+    Args:
+        program: name for the line on stderr.
+        work: gives an exit code.
+    Returns:
+        The work's exit code; 130 after Ctrl-C, 0 when nobody reads any more, 1 after an OSError.
+    """
     try:
-        code = _dispatch(arguments)
+        code = work()
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
     except KeyboardInterrupt:
-        print(f"rfconstruct {arguments[0]}: interrupted", file=sys.stderr)
+        print(f"{program}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         _silence_stdout()
         return ExitCode.OK
     except OSError as error:
         _silence_stdout()
-        what = f"{error.filename or 'output'}: {error.strerror or error}"
-        print(f"rfconstruct {' '.join(arguments[:1])}: {what}", file=sys.stderr)
+        print(f"{program}: {_refused(error)}", file=sys.stderr)
         return ExitCode.FAILURE
+
+
+def reported(program: str, as_json: bool, work: Callable[[], int]) -> int:
+    """Do the work of a verb; an error becomes one line on stderr, or with ``as_json`` one document on stdout.
+
+    Args:
+        program: name for the line on stderr.
+        as_json: whether a machine reads.
+        work: gives an exit code.
+    Returns:
+        The work's exit code, or the error's.
+    Raises:
+        OSError: for ``survived``; with ``as_json`` only BrokenPipeError.
+    """
+    try:
+        return int(work())
+    except RfconstructError as error:
+        return _report(program, error, as_json)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        if not as_json:
+            raise
+        return _report(program, RfconstructError(_refused(error)), as_json)
+
+
+def _refused(error: OSError) -> str:
+    return f"{error.filename or 'output'}: {error.strerror or error}"
 
 
 def _dispatch(arguments: Sequence[str]) -> int:
@@ -97,10 +136,7 @@ def _run(verb: str, rest: Sequence[str]) -> int:
     module.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="machine-readable output on stdout")
     args = parser.parse_args(rest)
-    try:
-        return int(module.run(args))
-    except RfconstructError as error:
-        return _report(verb, error, args.json)
+    return reported(f"rfconstruct {verb}", args.json, lambda: module.run(args))
 
 
 def _command(verb: str) -> ModuleType:
@@ -113,13 +149,13 @@ def _command(verb: str) -> ModuleType:
         raise OSError(errno.EROFS, "set NUMBA_CACHE_DIR to a writable folder", "cache of compiled kernels") from error
 
 
-def _report(verb: str, error: RfconstructError, as_json: bool) -> int:
+def _report(program: str, error: RfconstructError, as_json: bool) -> int:
     if as_json:
         value = None if error.value is None else str(error.value)
         content = {"what": error.what, "value": value, "allowed": error.allowed, "action": error.action}
         print(json.dumps({"error": content, "exit_code": int(error.exit_code)}))
     else:
-        print(f"rfconstruct {verb}: {error}", file=sys.stderr)
+        print(f"{program}: {error}", file=sys.stderr)
     return int(error.exit_code)
 
 

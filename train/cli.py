@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 
-from edge.errors import RfconstructError
+from edge.cli import reported, survived
 from train.bench_completion import add_verb as add_completion_bench_verb
 from train.evaluate_command import add_verb as add_evaluate_verb
 from train.export_command import add_verb as add_export_verb
@@ -28,18 +27,13 @@ EXIT_CODES = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns an exit code of ``edge.errors.ExitCode``."""
+    return survived("rfconstruct-train", lambda: _dispatch(arguments))
+
+
+def _dispatch(arguments: Sequence[str] | None) -> int:
     options = _parser().parse_args(arguments)
     options.own_process = arguments is None
-    try:
-        return int(options.run(options))
-    except RfconstructError as error:
-        if getattr(options, "json", None) is True:
-            value = None if error.value is None else str(error.value)
-            content = {"what": error.what, "value": value, "allowed": error.allowed, "action": error.action}
-            print(json.dumps({"error": content, "exit_code": int(error.exit_code)}))
-        else:
-            print(f"rfconstruct-train: {error}", file=sys.stderr)
-        return int(error.exit_code)
+    return reported("rfconstruct-train", getattr(options, "json", None) is True, lambda: options.run(options))
 
 
 def _parser() -> argparse.ArgumentParser:

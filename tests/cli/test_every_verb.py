@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from cli_run import rfconstruct
 
+from edge import cli
 from edge.cli import VERBS
 from edge.errors import ExitCode
 from train.cli import EXIT_CODES, _parser, main
+from train.objects import commands
 from train.output import emit
 
 SCREEN_LINES = 40
@@ -70,6 +72,29 @@ def test_errors_are_documents_too(capsys: pytest.CaptureFixture[str]) -> None:
     error = json.loads(capsys.readouterr().out)
     assert code == error["exit_code"] != 0
     assert error["error"]["what"]
+
+
+@pytest.mark.parametrize(("error", "code", "told"), [
+    (KeyboardInterrupt(), 130, "rfconstruct-train: interrupted\n"),
+    (BrokenPipeError(), 0, ""),
+    (OSError(28, "Disk full", "/disk/file"), 1, "rfconstruct-train: /disk/file: Disk full\n"),
+    (OSError(28, "Disk full"), 1, "rfconstruct-train: output: Disk full\n"),
+])  # fmt: skip
+def test_what_the_system_refuses_is_no_traceback(
+    error: BaseException, code: int, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(commands, "_chosen", fail)
+    monkeypatch.setattr(cli, "_silence_stdout", lambda: None)
+    assert main(["objects", "list"]) == code
+    assert capsys.readouterr() == ("", told)
+    if type(error) is OSError:
+        assert main(["objects", "list", "--json"]) == code
+        document = json.loads(capsys.readouterr().out)
+        assert document["exit_code"] == code
+        assert f"rfconstruct-train: {document['error']['what']}\n" == told
 
 
 def test_what_a_machine_reads_is_strict_json(capsys: pytest.CaptureFixture[str]) -> None:
