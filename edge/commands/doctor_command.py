@@ -21,6 +21,7 @@ from pathlib import Path
 from edge import numba_cache
 from edge.commands.checks import Check, failure, lines
 from edge.commands.key_checks import keys_check
+from edge.commands.system_checks import buffers, clock, devices
 from edge.config import CompletionSettings, StreamSettings
 from edge.errors import ExitCode, RfconstructError
 from edge.resources import data_dir
@@ -62,6 +63,9 @@ def run(args: argparse.Namespace) -> int:
         cache,
         *([kernels] if args.warm else []),
         port,
+        buffers,
+        clock,
+        devices,
         _keys(args),
         data,
     ]

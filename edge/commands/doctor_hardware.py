@@ -17,6 +17,7 @@ from pathlib import Path
 from edge.board_settings import CaptureCardBoard, CascadeBoard
 from edge.commands.checks import Check, failure, lines
 from edge.commands.hardware import make_boards
+from edge.commands.key_checks import keys_check
 from edge.commands.network_checks import receive_buffer, tcp_port, way_to
 from edge.drivers.board import Board
 from edge.drivers.dca1000.control import CaptureCard
@@ -43,21 +44,28 @@ Step = tuple[str, Callable[[], str | Check]]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Every check in its order, each within a stated time; exit code 0, or 4 when a link is dead."""
+    """Every check in its order, each within a stated time; exit code 0, 4 when a link is dead, 3 when only keys are."""
     if args.rig is None:
         raise ConfigError("the hardware of which rig?", action="give it with --rig")
-    checks: list[Check] = []
-    for check in HardwareDoctor(args.rig, args.boards, not args.quick).checks():
+    doctor, checks = HardwareDoctor(args.rig, args.boards, not args.quick), list[Check]()
+    for check in _links_and_keys(doctor):
         checks.append(check)
         if not args.json:
             print("\n".join(lines(check)), flush=True)
-    failed = sum(check.outcome == "fails" for check in checks)
-    code = ExitCode.NO_HARDWARE if failed else ExitCode.OK
+    keys_fail = checks[-1].outcome == "fails"
+    dead = sum(check.outcome == "fails" for check in checks[:-1])
+    code = ExitCode.NO_HARDWARE if dead else ExitCode.DEGRADED if keys_fail else ExitCode.OK
     if args.json:
         print(json.dumps({"checks": [asdict(check) for check in checks], "exit_code": int(code)}, indent=2))
     else:
-        print(f"{failed} of {len(checks)} links are dead" if failed else "the hardware is ready")
+        ready = f"{dead} of {len(checks) - 1} links are dead" if dead else "the hardware is ready"
+        print(f"{ready}, the keys are not" if keys_fail else ready)
     return code
+
+
+def _links_and_keys(doctor: HardwareDoctor) -> Iterator[Check]:
+    yield from doctor.checks()
+    yield keys_check(doctor.rig.settings.stream)
 
 
 @dataclass

@@ -12,6 +12,7 @@ from cli_run import Outcome, rfconstruct
 from virtual_boards import Virtual, virtual_boards
 
 from edge.commands import doctor_hardware, network_checks
+from edge.commands.checks import Check
 from edge.errors import ExitCode, LinkError
 
 
@@ -163,6 +164,18 @@ def test_two_boards_at_one_address(tmp_path: Path) -> None:
     outcome = rfconstruct("doctor", "--hardware", "--rig", "cascade_pair", "--boards", boards)
     assert outcome.code == ExitCode.NO_HARDWARE
     assert "share one control address" in outcome.out
+
+
+def test_keys_of_the_rig_are_looked_at_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = Check("keys", "fails", "server.key_secret is open to others (mode 0644)", "chmod 600")
+    with virtual_boards("awr1843_pair", tmp_path) as virtual:
+        assert checks(doctor(virtual, "--json", "--quick"))["keys"]["outcome"] == "ok"
+        monkeypatch.setattr(doctor_hardware, "keys_check", lambda stream: wrong)
+        virtual.boards.write_text(virtual.boards.read_text().replace('kind = "zmq"', 'kind = "none"'))
+        told = doctor(virtual, "--quick")
+    assert told.code == ExitCode.DEGRADED, told.out
+    assert "open to others" in told.out
+    assert told.out.endswith("the hardware is ready, the keys are not\n")
 
 
 def test_rig_is_needed() -> None:
