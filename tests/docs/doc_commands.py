@@ -15,7 +15,7 @@ SHELLS = ("sh", "bash", "console")
 """Kinds of blocks that hold commands and nothing else."""
 PROGRAMS = frozenset(
     {"rfconstruct", "rfconstruct-train", "make", "python", "pytest", "pip", "torchrun", "g++", "./subscriber", "ssh"}
-    | {"sudo", "curl", "echo", "ls", "cp", "mkdir", ".", "export", "systemctl", "systemd-analyze", "journalctl"}
+    | {"sudo", "curl", "echo", "ls", "cp", "mkdir", ".", "export", "systemctl", "systemd-analyze", "journalctl", "find"}
     | {"packaging/build_deb.sh"}
 )
 """First words that make a block without a kind one of commands."""

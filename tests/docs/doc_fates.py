@@ -19,7 +19,7 @@ ELSEWHERE: tuple[tuple[str, str, str], ...] = (
     ("docs/client.md", r"g\+\+|\./subscriber", "tests/examples/test_cpp_subscriber.py"),
     ("docs/recordings.md", r"rfconstruct (?:info|replay|recover|export)", "tests/cli/test_recordings_doc.py"),
     ("docs/service.md", r"rfconstruct keys", "tests/service/test_service_doc.py"),
-    ("docs/service.md", r"systemd-analyze", "tests/service/test_service_doc.py"),
+    ("docs/service.md", r"systemd-analyze|find", "tests/service/test_service_doc.py"),
     ("docs/service.md", r"packaging/build_deb.sh", "tests/packaging/test_deb.py"),
     ("docs/own_data.md", r"rfconstruct-train (?!objects import|objects list)", "tests/docs/test_own_data.py"),
     ("", r"rfconstruct view", "tests/view/test_view_command.py"),

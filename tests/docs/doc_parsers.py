@@ -19,7 +19,7 @@ from train.cli import _parser as train_parser
 
 FOREIGN = frozenset(
     {"ssh", "curl", "echo", "ls", "mkdir", "cp", ".", "export", "./subscriber"}
-    | {"systemctl", "systemd-analyze", "journalctl"}
+    | {"systemctl", "systemd-analyze", "journalctl", "find"}
 )
 """Programs of the system: only files of the project that they name are looked at."""
 PROJECT_FILE = re.compile(r"(?:edge|train|tests|examples|docs|systemd|packaging|firmware_cfg|requirements)/[\w/.\-]+")

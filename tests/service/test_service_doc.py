@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
 import subprocess
+import time
 import tomllib
 from pathlib import Path
 
@@ -82,3 +84,30 @@ def test_other_commands_name_what_exists(capsys: pytest.CaptureFixture[str]) -> 
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         assert option in capsys.readouterr().out
+
+
+def test_old_recordings_go_by_the_stated_line_and_no_others(tmp_path: Path) -> None:
+    if shutil.which("systemd-tmpfiles") is None:
+        pytest.skip("no systemd-tmpfiles here: apt-get install systemd")
+    (line,) = re.findall(r"^```\n(e /\S+ .*)\n```$", TEXT, re.MULTILINE)
+    folder = line.split()[1]
+    assert f"--record {folder}`" in TEXT
+    assert f"d       {folder} " in (ROOT / "systemd/tmpfiles/rfconstruct.conf").read_text(encoding="utf-8")
+    place, rules = tmp_path / folder.lstrip("/"), tmp_path / "etc/tmpfiles.d/rfconstruct-recordings.conf"
+    for parent in (place, rules.parent):
+        parent.mkdir(parents=True)
+    rules.write_text(line + "\n")
+    for name, days in (("old", 15.5), ("kept", 15.5), ("recent", 12.5), ("running", 0.0)):
+        path = place / f"{name}.mcap"
+        path.touch()
+        then_s = time.time() - 86400 * days
+        os.utime(path, (then_s, then_s))
+    (place / "kept.mcap").chmod(0o1600)
+    (find,) = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("find ")]
+    listed = subprocess.run(
+        shlex.split(find.replace(folder, str(place))), capture_output=True, text=True, timeout=10, check=True
+    )
+    assert listed.stdout.split() == [str(place / "old.mcap")]
+    clean = ["systemd-tmpfiles", "--clean", f"--root={tmp_path}", rules.name]
+    subprocess.run(clean, timeout=60, check=True)
+    assert sorted(path.stem for path in place.iterdir()) == ["kept", "recent", "running"]
