@@ -32,6 +32,7 @@ DEFAULT_FRAMES = 64
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.usage = "%(prog)s CAPTURE... --out OUT [options]"
     help_text = "recording (.mcap) or folder of one radar's capture files; with --align recordings of both radars"
     parser.add_argument("capture", nargs="+", type=Path, help=help_text)
     add_rig_arguments(parser)

@@ -31,6 +31,7 @@ AT_THE_EDGES = (LossCause.NO_POSE, LossCause.UNPAIRED)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
+    parser.usage = "%(prog)s --rig RIG [options]"
     parser.add_argument("--rig", required=True, help="name or folder")
     parser.add_argument("--boards", type=Path, metavar="FILE", help="where the boards and the pose sensor are reached")
     parser.add_argument("--calibration", action="append", default=[], metavar="FILE", help="[RADAR=]FILE (.npz, .mat)")
