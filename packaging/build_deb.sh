@@ -43,8 +43,12 @@ put 0644 systemd/tmpfiles/rfconstruct.conf /usr/lib/tmpfiles.d/rfconstruct.conf
 put 0644 systemd/sysusers/rfconstruct.conf /usr/lib/sysusers.d/rfconstruct.conf
 put 0644 packaging/debian/environment /etc/rfconstruct/environment
 put 0644 LICENSE /usr/share/doc/rfconstruct/copyright
-put 0644 docs/service.md /usr/share/doc/rfconstruct/service.md
-put 0644 docs/wire_format.md /usr/share/doc/rfconstruct/wire_format.md
+for page in service hardware poses_and_usb calibration recordings client wire_format troubleshooting; do
+    put 0644 "docs/$page.md" "/usr/share/doc/rfconstruct/$page.md"
+done
+for example in print_shapes.py save_ply.py ros2_pointcloud2.py rerun_view.py cpp/subscriber.cpp; do
+    put 0644 "examples/$example" "/usr/share/doc/rfconstruct/examples/$example"
+done
 ln -s /opt/rfconstruct/bin/rfconstruct "$root/usr/bin/rfconstruct"
 
 # Takes out what the appliance never loads. Licences of what stays lie in *.dist-info and beside the code; they stay.

@@ -26,6 +26,8 @@ FILES = {
     "usr/lib/sysusers.d/rfconstruct.conf": 0o644,
     "usr/share/doc/rfconstruct/copyright": 0o644,
     "usr/share/doc/rfconstruct/service.md": 0o644,
+    "usr/share/doc/rfconstruct/troubleshooting.md": 0o644,
+    "usr/share/doc/rfconstruct/examples/cpp/subscriber.cpp": 0o644,
     "etc/rfconstruct/environment": 0o644,
 }
 SCRIPTS = ("postinst", "prerm", "postrm")
@@ -67,6 +69,16 @@ def test_installed_files_are_those_of_the_project(package: tuple[Path, Path]) ->
         ("usr/lib/udev/rules.d/60-rfconstruct.rules", "systemd/udev/60-rfconstruct.rules"),
     ):
         assert (root / name).read_bytes() == (ROOT / source).read_bytes()
+
+
+def test_the_pages_that_an_operator_needs_lie_beside_each_other(package: tuple[Path, Path]) -> None:
+    folder = package[0] / "usr/share/doc/rfconstruct"
+    pages = {path.name for path in folder.glob("*.md")}
+    text = (folder / "service.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"\]\((\w+\.md)", text)) <= pages
+    shipped = {str(path.relative_to(folder / "examples")) for path in (folder / "examples").rglob("*.*")}
+    examples = ROOT / "examples"
+    assert shipped == {str(one.relative_to(examples)) for kind in ("*.py", "*.cpp") for one in examples.rglob(kind)}
 
 
 def test_control_fields(package: tuple[Path, Path]) -> None:
