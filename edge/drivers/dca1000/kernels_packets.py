@@ -71,6 +71,51 @@ def read_control(control: UInt8, lengths: Int64, count: int, shift_ns: int, stam
             place += (length + 7) // 8 * 8
 
 
+@njit(inline="always", **OPTIONS)
+def _count(counters: Int64, what: int, size: int) -> None:
+    """One more packet, and its bytes in the counter behind."""
+    counters[what] += 1
+    counters[what + 1] += size
+
+
+@njit(inline="always", **OPTIONS)
+def _position(packet: UInt8, payload: int) -> tuple[int, int]:
+    """First byte in the recording and slot of a packet; slot -1: header and length contradict each other."""
+    begin, slot = int64(0), int64(-1)
+    if 0 < payload <= P:
+        begin = _little(packet, 4, 6)
+        if begin % P == 0 and (begin // P + 1) & 0xFFFFFFFF == _little(packet, 0, 4):
+            slot = begin // P
+    return begin, slot  # type: ignore[return-value]
+
+
+@njit(inline="always", **OPTIONS)
+def _without_late(counters: Int64, fresh: int, end: int, floor: int) -> int:
+    """First of the bytes [fresh, end) that a frame from byte ``floor`` on still waits for; those before are counted."""
+    if fresh < floor:
+        late = min(floor, end) - fresh
+        _count(counters, LATE, late)
+        fresh += late
+    return fresh
+
+
+@njit(inline="always", **OPTIONS)
+def _copy(
+    packets: UInt8, n: int, begin: int, fresh: int, end: int, stamp: int, ring: UInt8, received: Int64, arrival: Int64
+) -> None:
+    """Copy bytes [fresh, end) of packet ``n``, which begins at byte ``begin``, to the frames that they belong to."""
+    frames, size = ring.shape
+    while fresh < end:
+        frame = fresh // size
+        row, inside = frame % frames, fresh - frame * size
+        stop = min(end, (frame + 1) * size)
+        ring[row, inside : inside + stop - fresh] = packets[n, H + fresh - begin : H + stop - begin]
+        received[row] += stop - fresh
+        if inside == 0:
+            arrival[row] = stamp
+        fresh = stop
+
+
 @njit(
     int64(
         *(uint8[:, ::1], int32[::1], uint32[::1], int64[::1], int64, int64, uint32, int64, int64),
@@ -104,58 +149,36 @@ def place(packets: UInt8, sizes: Int32, senders: UInt32, stamps: Int64, first: i
             return n
         length = int64(sizes[n])
         if sender != 0 and senders[n] != sender:
-            counters[PACKETS] += 1
-            counters[BYTES] += length
-            counters[FOREIGN] += 1
-            counters[FOREIGN_BYTES] += length
+            _count(counters, PACKETS, length)
+            _count(counters, FOREIGN, length)
             continue
-        begin, slot, payload = int64(0), int64(-1), length - H
-        if 0 < payload <= P:
-            begin = _little(packets[n], 4, 6)
-            if begin % P == 0 and (begin // P + 1) & 0xFFFFFFFF == _little(packets[n], 0, 4):
-                slot = begin // P
+        payload = length - H
+        begin, slot = _position(packets[n], payload)
         end = begin + payload
         if slot >= 0 and end > (state[BASE] + frames) * size and (state[BEGUN] or slot < start_slots):
             return n
-        counters[PACKETS] += 1
-        counters[BYTES] += length
+        _count(counters, PACKETS, length)
         if slot < 0:
-            counters[GARBAGE] += 1
-            counters[GARBAGE_BYTES] += length
+            _count(counters, GARBAGE, length)
             continue
         counters[HEADERS] += H
         if (slot >= start_slots and not state[BEGUN]) or slot <= state[TOP_SLOT] - slots:
-            counters[OUTSIDE] += 1
-            counters[OUTSIDE_BYTES] += payload
+            _count(counters, OUTSIDE, payload)
             state[OUTSIDE_IN_A_ROW] += 1
             continue
         if not state[BEGUN]:
             state[BEGUN], state[FIRST_NS] = 1, stamps[n]
         state[OUTSIDE_IN_A_ROW] = 0
-        before = int64(got[slot % slots])
-        twice = min(before, payload)
+        twice = min(int64(got[slot % slots]), payload)
         counters[DUPLICATE_BYTES] += twice
         counters[DUPLICATE] += twice == payload
         fresh = begin + twice
         if fresh == end:
             continue
         got[slot % slots] = uint16(payload)
-        floor = state[BASE] * size
-        if fresh < floor:
-            late = min(floor, end) - fresh
-            counters[LATE_BYTES] += late
-            counters[LATE] += 1
-            fresh += late
+        fresh = _without_late(counters, fresh, end, state[BASE] * size)
         counters[REORDERED] += fresh < end and end < state[HIGHEST]
         state[HIGHEST] = max(state[HIGHEST], end)
-        while fresh < end:
-            frame = fresh // size
-            row, inside = frame % frames, fresh - frame * size
-            stop = min(end, (frame + 1) * size)
-            ring[row, inside : inside + stop - fresh] = packets[n, H + fresh - begin : H + stop - begin]
-            received[row] += stop - fresh
-            if inside == 0:
-                arrival[row] = stamps[n]
-            counters[PLACED] += stop - fresh
-            fresh = stop
+        counters[PLACED] += end - fresh
+        _copy(packets, n, begin, fresh, end, stamps[n], ring, received, arrival)
     return count
