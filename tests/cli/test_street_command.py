@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge.accounting import FrameLedger
 from edge.errors import ConfigError, DependencyError
-from edge.frames import RADARS, Float32, ObjectCloud, Pose, Shape
+from edge.frames import RADARS, Float32, LossCause, ObjectCloud, Pose, Shape
 from edge.recording.reader import RecordingReader
 from edge.rig import load_rig
 from edge.stream.client import connect
@@ -23,7 +24,7 @@ from edge.stream.messages import StatusMessage
 from train.objects.reference import ObjectRef
 from train.simulate import street_command, street_stream
 from train.simulate.street import Street, StreetSettings, make_street
-from train.simulate.street_report import ShapeLog, as_dict, chamfer_m, find, lines, verdicts
+from train.simulate.street_report import ShapeLog, as_dict, busy_note, chamfer_m, find, lines, verdicts
 
 PEDESTRIAN = ObjectRef("pedestrian", "parametric_00017")
 MOTORCYCLE = ObjectRef("motorcycle", "parametric_00008")
@@ -181,6 +182,19 @@ def test_an_object_far_from_everybody_is_a_ghost(street: Street) -> None:
     assert "nobody (ghost)" in text[1]
     assert text[-1].startswith("object 7 is nobody: 8.")
     assert as_dict(street, findings, 8.0)["users"] == ["motorcycle: MISSED", "pedestrian: MISSED"]
+
+
+def test_a_busy_machine_is_named() -> None:
+    ledgers = [FrameLedger(radar) for radar in RADARS]
+    for ledger in ledgers:
+        ledger.frame_in(100)
+        ledger.lost(LossCause.GAP, 100)
+    assert busy_note([ledger.snapshot() for ledger in ledgers], 0.01) == ""
+    for ledger in ledgers:
+        ledger.frame_in(100)
+        ledger.lost(LossCause.SHED, 40)
+        ledger.lost(LossCause.OVERFLOW, 60)
+    assert "200 of 400 frames" in busy_note([ledger.snapshot() for ledger in ledgers], 0.01)
 
 
 def test_chamfer_is_the_mean_of_both_directions() -> None:

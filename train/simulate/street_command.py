@@ -198,7 +198,9 @@ class _Drive:
         return viewer
 
     def note_pace(self, pace: float) -> None:
-        """Say when the simulator was slower than ``pace``; the live pipeline then had more time than on a vehicle."""
+        """Say when the simulator was slower than ``pace``, so that the pipeline had time; or the pipeline too slow."""
+        from train.simulate.street_report import busy_note
+
         seconds = 0.0 if self.log.t_ns is None else self.street.drive.seconds(self.log.t_ns - self.shift_ns)
         taken_s = self.wall_s[1] - self.wall_s[0]
         if pace > 0 and 1.0 < seconds < KEPT_PACE * pace * taken_s:
@@ -206,6 +208,8 @@ class _Drive:
                 f"NOT IN REAL TIME: {seconds:.1f} s of the drive took {taken_s:.1f} s, because the simulator had too "
                 "little of this machine (other work on it? --rig cascade_demo needs a third)"
             )
+        accounts = [ledger.snapshot() for ledger in self.session.pipeline.ledgers.values()]
+        self.notes += [note] if (note := busy_note(accounts, MOST_LOST)) else []
 
     def _run(self) -> None:
         switch_s = sys.getswitchinterval()

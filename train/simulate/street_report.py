@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from edge.accounting import LedgerSnapshot
 from edge.best_shapes import class_text
-from edge.frames import Float32, Shape
+from edge.frames import Float32, LossCause, Shape
 from edge.pipeline import FrameResult, WindowResult
 from train.nearest import nearest_distance, nearest_index
 from train.simulate.street import Street
@@ -21,6 +22,26 @@ GHOST_M = 0.5
 """An object whose radar points are farther from every user, on average, is none of them."""
 MERGED_SHARE = 0.2
 """A second user to whom at least this share of an object's points belongs is in it too."""
+
+
+def busy_note(accounts: Iterable[LedgerSnapshot], most: float) -> str:
+    """What to say when frames were left out because the machine was too busy.
+
+    Args:
+        accounts: of every radar.
+        most: share of the frames that may be lost without a word.
+    Returns:
+        One sentence; empty: there is nothing to say.
+    """
+    accounts = list(accounts)
+    frames = sum(account.frames_in for account in accounts)
+    left = sum(account.lost.get(cause, 0) for account in accounts for cause in (LossCause.OVERFLOW, LossCause.SHED))
+    if left <= most * frames:
+        return ""
+    return (
+        f"DEGRADED: {left} of {frames} frames were left out (overflow, shed), because the pipeline had too little of "
+        "this machine: end other work, or --rig cascade_demo, which needs a third"
+    )
 
 
 class ShapeLog:
