@@ -169,7 +169,9 @@ def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str
     start, data = settings.get("start", ""), settings.get("data", {})
     more = "".join(f" --option {key}={_plain(value)}" for key, value in settings.get("options", {}).items())
     more += "" if settings.get("precision", "fp32") == "fp32" else f" --precision {settings['precision']}"
-    more += f" --start runs/{Path(start).parent.name}/{Path(start).name}" if start else ""
+    root = "runs" if Path(start).suffix == ".pt" else "models"  # of a checkpoint, or of a shipped model
+    names = (Path(start).parent.name, Path(start).name) if root == "runs" else (Path(start).name,)
+    more += f" --start {'/'.join((root, *names))}" if start else ""
     if "simulated_share" in data:
         more += f" --simulated DRIVE_BYS --simulated-share {data['simulated_share']:g}"
     sets = " --simulated DRIVE_BYS" if options.simulated else ""
