@@ -135,7 +135,7 @@ class HeatmapPainter:
 
 def strip(samples: Sequence[Sample], wall_s: float, span_s: float = 60.0) -> Picture:
     """Latency of every stage (99th percentile) and frames lost, over the last minute, uint8 [height, 720, 3]."""
-    image, draw = blank(360)
+    image, draw = blank(408)  # room for four rows of three stages
     recent = [sample for sample in samples if wall_s - sample.wall_s <= span_s]
     stages = list(recent[-1].latency_ms) if recent else []
     top_ms = _round_up(max((value for s in recent for value in s.latency_ms.values()), default=1.0))
@@ -154,7 +154,7 @@ def strip(samples: Sequence[Sample], wall_s: float, span_s: float = 60.0) -> Pic
         column, row = number % 3, number // 3
         label = f"{stage} {recent[-1].latency_ms[stage]:.1f} ms"
         text(draw, (left + column * 212, bottom + 10 + row * 26), label, colour, SMALL_PX)
-    _losses(draw, recent, wall_s, span_s, (left, right, 290, 336))
+    _losses(draw, recent, wall_s, span_s, (left, right, 338, 384))
     return np.asarray(image)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from train.simulate.street import Street, StreetSettings
     from train.simulate.street_files import RoadPictures
     from train.simulate.street_report import Finding, ShapeLog
-    from train.simulate.street_stream import Viewer
+    from train.simulate.street_stream import ResultsRecording, Viewer
 
 RIG = "cascade_pair"
 LENGTH_M = 20.0
@@ -125,7 +125,7 @@ class _Drive:
         shift_ns: by which the source's instants are later than the street's.
         wall_s: when the first and the last frame came.
         cpu_s: processor time of this process then.
-        recording: of the results; None: there is none.
+        recording: of the results; None: there is none. results: writes it.
     """
 
     street: Street
@@ -137,6 +137,7 @@ class _Drive:
     wall_s: tuple[float, float] = (0.0, 0.0)
     cpu_s: tuple[float, float] = (0.0, 0.0)
     recording: Path | None = None
+    results: ResultsRecording | None = None
     notes: list[str] = field(default_factory=list)
 
     @staticmethod
@@ -189,6 +190,7 @@ class _Drive:
             self._run()
             return None
         with ResultsRecording(endpoint, options.out / "street.mcap") as recording:
+            self.results = recording
             self._run()
         self.recording = recording.path
         if recording.failure:
@@ -228,6 +230,8 @@ class _Drive:
         self.session.say(f"simulator ready after {time.monotonic() - start_s:.1f} s")
         if self.source.pace > 0:
             self._make_ahead()
+        if self.results is not None:
+            self.results.begin()
 
     def _make_ahead(self) -> None:
         """As many frames before the clock begins as the simulator will be behind at the end of the drive."""

@@ -21,7 +21,7 @@ END_S = 5.0
 
 
 class ResultsRecording:
-    """Records what is published until it is closed; the run goes on when it cannot.
+    """Records what is published from ``begin`` until it is closed; the run goes on when it cannot.
 
     Args:
         endpoint: of the publisher.
@@ -36,9 +36,12 @@ class ResultsRecording:
         path.unlink(missing_ok=True)
         self._client = RecordingClient(endpoint)
         self._recorder = Recorder(RecordingWriter(path, None, ["results of simulated radar data"]))
-        self._client.record_to(self._recorder)
         self._thread = threading.Thread(target=self._listen, name="street-recording", daemon=True)
         self._thread.start()
+
+    def begin(self) -> None:
+        """Record from here on: nobody wants to watch how the simulator makes its frames."""
+        self._client.record_to(self._recorder)
 
     def _listen(self) -> None:
         try:
