@@ -77,14 +77,16 @@ if [ "$venv" = yes ]; then
     "$python" -m venv --without-pip "$home"
     pip --python "$home/bin/python" install --no-compile --requirement "$top/requirements/edge.txt"
     pip --python "$home/bin/python" install --no-compile --no-deps "$work"/wheel/*.whl
-    slim "$home"/lib/python3.*/site-packages
+    site=$("$home/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+    slim "$site"
     # What was built in $root will lie in /: its interpreter is the system's, its paths begin at the root.
     for link in python python3; do ln -sfn "/usr/bin/python3.$python_minor" "$home/bin/$link"; done
     rm -f "$home/bin/python3.$python_minor" "$home/bin/"[Aa]ctivate*
     sed -i "1s|^#!.*python.*|#!/opt/rfconstruct/bin/python|" "$home/bin/rfconstruct"
     find "$home/bin" -type f ! -name rfconstruct -delete
-    rm -f "$home"/lib/python3.*/site-packages/rfconstruct-*.dist-info/direct_url.json
-    printf 'home = /usr/bin\ninclude-system-site-packages = false\nversion = 3.%s\n' "$python_minor" >"$home/pyvenv.cfg"
+    rm -f "$site"/rfconstruct-*.dist-info/direct_url.json
+    sed -i -e 's|^home = .*|home = /usr/bin|' -e "s|^version = .*|version = 3.$python_minor|" \
+        -e '/^executable = /d' -e '/^command = /d' "$home/pyvenv.cfg"
     "$python" -m compileall -q -s "$root" -p / "$home" >/dev/null || fail "a module does not compile"
 else
     printf '#!/bin/sh\necho "rfconstruct: this package was built with --no-venv" >&2\nexit 1\n' >"$home/bin/rfconstruct"

@@ -30,7 +30,7 @@ class OneClientServer:
         host, port: address; port 0: any free one.
         name: of the threads.
         session: makes what takes the bytes of a new client.
-        closed: called when a client is gone.
+        closed: called when a client is gone, before the next one is let in.
         refused: called when a second client was refused.
     """
 
@@ -50,6 +50,7 @@ class OneClientServer:
         self._name, self._session, self._closed, self._refused = name, session, closed, refused
         self._client: socket.socket | None = None
         self._lock, self._ending = threading.Lock(), False
+        self._leaving = threading.RLock()
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
@@ -67,10 +68,18 @@ class OneClientServer:
     def hang_up(self) -> None:
         """Close the present client's connection."""
         with self._lock:
-            client, self._client = self._client, None
+            client = self._client
         if client is not None:
             _shut(client)
-            self._closed()
+            self._release(client)
+
+    def _release(self, client: socket.socket) -> None:
+        """Give the place back, once: ``closed`` has run before another client can have it."""
+        with self._leaving:
+            if self._client is client:
+                self._closed()
+                with self._lock:
+                    self._client = None
 
     def send(self, data: bytes, piece: int = 0) -> None:
         """Send to the present client, if there is one; in writes of ``piece`` bytes when it is not 0."""
@@ -113,13 +122,8 @@ class OneClientServer:
         with contextlib.suppress(OSError):
             while (data := client.recv(4096)) and session.feed(data):
                 pass
-        with self._lock:
-            present = self._client is client
-            if present:
-                self._client = None
+        self._release(client)
         client.close()
-        if present:
-            self._closed()
 
 
 def _shut(connection: socket.socket) -> None:
