@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+from onnx import helper
 
 from edge.errors import ModelError
 from edge.frames import Float32
@@ -91,17 +92,35 @@ class _Builder:
         return self.graph.linear(source, self.weights[f"{name}.weight"], self.weights.get(f"{name}.bias"), name)
 
     def _center(self) -> None:
-        """Points about their centre, "centered" [n, 3]; the centre is 0 in the box, in sight the middle in x and y."""
+        """Points about their centre, "centered" [n, 3]; the centre is 0 in the box, in sight the middle in x and y.
+
+        "low" and "high" are the ends of the bounding box.
+        """
         graph, sight = self.graph, self.network.frame == "sight"
         places = "points"
         if self.network.columns > 3:
             places = graph.add("Slice", ["points", *(graph.integers(n) for n in (0, 3, 1))], "places")
         graph.add("ReduceMax", [places, graph.integers(0)], "high", keepdims=1)
         graph.add("ReduceMin", [places, graph.integers(0)], "low", keepdims=1)
-        graph.add("Add", ["high", "low"], "both_ends")
+        low, high = self._trimmed(places) if self.network.trim_percent else ("low", "high")
+        graph.add("Add", [high, low], "both_ends")
         half = np.array([[0.5, 0.5, 0.0]], np.float32) * sight
         graph.add("Mul", ["both_ends", graph.constant("half", half)], "center")
         graph.add("Sub", [places, "center"], "centered")
+
+    def _trimmed(self, places: str) -> tuple[str, str]:
+        """Ends [1, 3] of what ``train.network.middle`` leaves of every axis."""
+        graph = self.graph
+        count = graph.add("Shape", [places], "places_count", start=0, end=1)
+        last = graph.add("Sub", [count, graph.integers(1)], "places_last")
+        percent = graph.add("Mul", [last, graph.integers(self.network.trim_percent)], "left_out_percent")
+        low = graph.add("Div", [percent, graph.integers(100)], "left_out")
+        high = graph.add("Sub", [last, low], "left_in")
+        graph.nodes.append(
+            helper.make_node("TopK", [places, count], ["ordered", "order"], name="ordered", axis=0, largest=0)
+        )
+        ends = (graph.add("Gather", ["ordered", row], f"{row}_end", axis=0) for row in (low, high))
+        return next(ends), next(ends)
 
     def _inputs(self) -> str:
         """Coordinates and what the options add, scaled in the first layer's weight."""

@@ -89,11 +89,13 @@ class CompletionModel(nn.Module):
         coarse_loss: how the coarse cloud is compared with the truth.
         ramp: whether the fine cloud's weight rises during training (PCN) or is 1 throughout.
         columns: of the input: 3, or 4 with relative power in dB as the last.
+        trim_percent: of the points that the centre leaves out at each end of x and of y (``middle``).
     """
 
     coarse_loss: Literal["emd", "chamfer"] = "emd"
     ramp = True
     columns = 3
+    trim_percent = 0
 
     def __init__(self, frame: Frame, coarse_points: int = COARSE_POINTS, cells: int = PATCH_CELLS) -> None:
         super().__init__()
@@ -132,17 +134,30 @@ class CompletionModel(nn.Module):
     def to_units(self, points_m: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Centred points in network units [n, 3], the centres [b, 3] in the input's unit, the cloud of every point [n].
 
-        Line of sight: the centre is the middle of the bounding box in the plane, the ground in height. Box: 0.
+        Line of sight: the centre is the ``middle`` in the plane, the ground in height. Box: 0.
         """
         with torch.no_grad():
             points_m = points_m[:, :3].float() if points_m.dtype != torch.float64 else points_m[:, :3]
             clouds = torch.split(points_m, list(counts))
-            center_m = torch.stack([(cloud.amax(0) + cloud.amin(0)) / 2 for cloud in clouds])
+            center_m = torch.stack([middle(cloud, self.trim_percent) for cloud in clouds])
             center_m[:, 2] = 0
             center_m = center_m * (self.frame == "sight")
             repeats = torch.tensor(counts, device=points_m.device)
             owner = torch.repeat_interleave(repeats, output_size=len(points_m))
             return (points_m - center_m[owner]) / self.scale, center_m, owner
+
+
+def middle(cloud: Tensor, trim_percent: int = 0) -> Tensor:
+    """Middle of the bounding box of a cloud [n, 3], or of what is left of every axis without its ends: [3].
+
+    One stray point moves the middle of the box by half of its distance. With ``trim_percent`` the k smallest and the k
+    largest coordinates of every axis do not count, k = (n - 1) trim_percent // 100.
+    """
+    if trim_percent == 0:
+        return (cloud.amax(0) + cloud.amin(0)) / 2
+    left_out = (len(cloud) - 1) * trim_percent // 100
+    ordered = cloud.sort(0).values
+    return (ordered[len(cloud) - 1 - left_out] + ordered[left_out]) / 2
 
 
 def exactly(tensor: Tensor) -> torch.autocast:

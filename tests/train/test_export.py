@@ -76,6 +76,8 @@ NETWORKS: list[tuple[str, Frame, dict[str, Option]]] = [
     ("ours", "sight", {"attention": "tokens"}),
     ("ours", "sight", {"attention": "coarse", "uncertainty": True}),
     ("ours", "sight", EVERYTHING),
+    ("ours", "sight", {"mirror": "cue", "trim": 5}),
+    ("ours", "sight", EVERYTHING | {"trim": 20}),
 ]
 
 

@@ -34,6 +34,7 @@ def made(kind: str, frame: Frame, options: dict[str, Option], seed: int = 0) -> 
     [
         ("ours", "sight", {}),
         ("ours", "sight", {"mirror": "cue", "uncertainty": True}),
+        ("ours", "sight", {"mirror": "cue", "trim": 5}),
         ("ours", "box", {"mirror": "cue", "coarse": 512}),
         ("pcn", "sight", {}),
         ("paper", "box", {}),

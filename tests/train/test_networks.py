@@ -12,7 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from edge.errors import ConfigError
 from train.losses import LossSettings, Matcher, completion_loss
-from train.network import FINE_POINTS, SCALE_M, WIDTHS, CompletionModel, CompletionNetwork
+from train.network import FINE_POINTS, SCALE_M, WIDTHS, CompletionModel, CompletionNetwork, middle
 from train.networks.neighbours import farthest, fixed, neighbours, take
 from train.networks.ours import OurNetwork, OurOptions, mirrored
 from train.networks.registry import NETWORKS, build, parse_options
@@ -21,6 +21,7 @@ EVERYTHING = {
     "mirror": "cue", "attention": "both", "uncertainty": True, "coarse": 512, "power": True, "ground": True,
 }  # fmt: skip
 CASES = [("paper", {}), ("pcn", {}), ("ours", {}), ("ours", EVERYTHING), ("adapointr", {})]
+CENTERED = [*CASES, ("ours", {"trim": 5})]
 
 
 def network_of(name: str, options: dict[str, object]) -> CompletionModel:
@@ -84,14 +85,14 @@ def test_sizes_gradients_and_order(name: str, options: dict[str, object]) -> Non
         assert parameter.grad.abs().sum() > 0 or key.endswith("key_value.weight"), key
 
 
-@pytest.mark.parametrize(("name", "options"), CASES)
+@pytest.mark.parametrize(("name", "options"), CENTERED)
 def test_order_and_repetition_of_points_do_not_matter(name: str, options: dict[str, object]) -> None:
     network = network_of(name, options).double().eval()
     points = cloud(128, network.columns).double()
     order = torch.randperm(128, generator=torch.Generator().manual_seed(1))
     changes = [points[order]]
     if name != "adapointr":  # its grouping takes a fixed number of points, here 128
-        changes.append(torch.cat([points[order], points[:77]]))
+        changes.append(torch.cat([points[order], points if "trim" in options else points[:77]]))
     with torch.no_grad():
         reference = network(points, [128])
         for changed in changes:
@@ -123,6 +124,31 @@ def test_options_that_are_added_to_trained_weights_begin_at_no_effect() -> None:
     assert richer.begin_without([])
     assert not richer.begin_without([*missing, "fc.0.weight"])
     assert not plain.begin_without(missing)
+
+
+def test_trimmed_middle_is_that_of_what_is_left() -> None:
+    line = torch.arange(41.0)[torch.randperm(41, generator=torch.Generator().manual_seed(3))]
+    places = torch.stack([line, 2 * line, torch.zeros(41)], 1)
+    places[line == 40] = torch.tensor([1000.0, -500.0, 0.0])
+    torch.testing.assert_close(middle(places), torch.tensor([500.0, -211.0, 0.0]))
+    torch.testing.assert_close(middle(places, 5), torch.tensor([20.0, 38.0, 0.0]), msg="two of 41 at each end")
+    torch.testing.assert_close(middle(places[:19], 5), middle(places[:19]), msg="no point to leave out of 19")
+
+
+def test_with_trim_a_few_points_far_away_do_not_move_the_centre() -> None:
+    """5 % of a dense cloud, all on one side: the centre moves by no more than those places on the other side."""
+    inside = torch.rand(950, 3, generator=torch.Generator().manual_seed(4))
+    strays = torch.tensor([3.0, 5.0, 0.0]).expand(40, 3)
+    for trim, least_m, most_m in ((0, 1.0, 3.0), (5, 0.0, 0.04)):
+        network = OurNetwork(WIDTHS["tiny"], 4, "sight", OurOptions(trim=trim)).eval()
+        with torch.no_grad():
+            clean, soiled = (network(p, [len(p)]).center for p in (inside, torch.cat([inside, strays])))
+        assert clean is not None
+        assert soiled is not None
+        moved = (soiled - clean)[0].abs()
+        assert (moved[:2] >= least_m).all(), (trim, moved)
+        assert (moved[:2] <= most_m).all(), (trim, moved)
+        assert moved[2] == 0, "height is from the ground"
 
 
 def test_mirror_image() -> None:

@@ -2,7 +2,8 @@
 """Our network: the paper's, narrow, in the line-of-sight frame, with switches for what may make it better.
 
 Every switch is off by default; with all off it is ``CompletionNetwork`` of the same width. None needs farthest-point
-sampling or a loop over the data, and order and repetition of the input points never matter.
+sampling or a loop over the data, and order and repetition of the input points never matter (with ``trim``, which counts
+points, repetition nearly does not).
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class OurOptions:
         coarse: 1024 coarse points with 16 cells, or 512 with 32.
         power: relative power in dB as an input column.
         ground: nearness to the ground as an input.
+        trim: percent of the points that do not count at each end of x and of y when the cloud is centred.
     """
 
     mirror: Mirror = "none"
@@ -54,11 +56,13 @@ class OurOptions:
     coarse: int = COARSE_POINTS
     power: bool = False
     ground: bool = False
+    trim: int = 0
 
     def __post_init__(self) -> None:
         require(self.mirror in get_args(Mirror), "option mirror", self.mirror, ", ".join(get_args(Mirror)))
         require(self.attention in get_args(Attend), "option attention", self.attention, ", ".join(get_args(Attend)))
         require(self.coarse in (512, 1024), "option coarse", self.coarse, "512, 1024")
+        require(0 <= self.trim < 50, "option trim", self.trim, "0..49 percent")
 
 
 class OurNetwork(CompletionNetwork):
@@ -78,6 +82,7 @@ class OurNetwork(CompletionNetwork):
         require(not options.ground or frame == "sight", "option ground", frame, "frame sight: only there z is a height")
         self.options = options
         self.columns = 4 if options.power else 3
+        self.trim_percent = options.trim
         channels, hidden, fold = width.local[1], width.local[0], width.fold
         if options.mirror != "none":
             self.plane = nn.Linear(channels, 3)
