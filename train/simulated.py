@@ -3,27 +3,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.completion.sight import bearing_rad
+from edge.completion.sight import bearing_rad, turned
 from edge.config import require
 from edge.errors import RecordingError
+from edge.frames import Float32
 from train.dataset import CompletionDataset, DatasetSettings, Sample, spread
 from train.objects.library import SPLITS, Split
 from train.objects.mesh import CLASSES, Mesh, MeshError
 from train.objects.reference import HUMAN_FILE, ObjectRef
 from train.objects.sampling import sample_surface
 from train.simulate.shards import Cloud, read_clouds
-from train.vary_cloud import hidden, stretch, window, with_strays
+from train.vary_cloud import borrowed, hidden, strays, stretch, window, with_strays
 
 USABLE = ("whole", "split")
 """Clouds that are the object's: not merged with something else, not missing."""
 THIN_SHARE, MIRROR_SHARE = 0.5, 0.5
 WINDOW_SHARE, HIDDEN_SHARE, STRETCH_SHARE, STRAY_SHARE = 0.3, 0.3, 0.5, 0.2
+BORROWED_SHARE = 0.3
+"""Chance of the strays of another drive-by, for scans too."""
+_SURFACE_POINTS = 2048
+_VARIATION = 2
+"""Of the ways in which clouds are varied: a run is continued with those that it began with."""
 _SIZE_TOLERANCE_M = 2e-3
 _OWN = 1
 """Sets the generator of a simulated sample apart from that of the perturbed one with the same index."""
@@ -36,7 +43,8 @@ class SimulatedDataset(CompletionDataset):
     errors are those of ``CompletionDataset``. In train a cloud is varied (``vary_cloud``: shorter window, hidden part,
     stretched with its truth, stray points), thinned half of the time (log-uniform, down to ``min_points``) and mirrored
     half of the time; val and test take every cloud once, as it is. Samples that are not simulated are the very ones
-    that ``CompletionDataset`` gives for this index.
+    that ``CompletionDataset`` gives for this index. Without box, samples of both kinds are given the strays of another
+    drive-by at times, where these lay about the object that the other one saw.
 
     Args:
         source: folder of a data set, or file of clouds.
@@ -58,6 +66,7 @@ class SimulatedDataset(CompletionDataset):
         here = {name: _is_here(name, settings.objects_dir) for name in {cloud.object for cloud in mine}}
         self.absent = sorted(name for name, present in here.items() if not present)
         """Objects whose mesh this machine does not have; their clouds are left out."""
+        self._strays: dict[int, Float32] = {}
         enough = [cloud for cloud in mine if here[cloud.object] and len(cloud) >= settings.min_points]
         self.clouds = enough
         self._of_label = [[c for c in enough if c.object.startswith(f"{name}/")] for name in CLASSES]
@@ -75,7 +84,7 @@ class SimulatedDataset(CompletionDataset):
     def description(self) -> dict[str, object]:
         """What decides the samples beside seed and settings."""
         data = {"simulated_set": self.identity, "simulated_share": self.share, "simulated_clouds": len(self.clouds)}
-        return super().description | data | {"simulated_variation": self.settings.vary_clouds}
+        return super().description | data | {"simulated_variation": _VARIATION * self.settings.vary_clouds}
 
     @property
     def summary(self) -> str:
@@ -92,9 +101,29 @@ class SimulatedDataset(CompletionDataset):
         if self.split != "train":
             return self._seen(self.clouds[index], rng)
         clouds = self._of_label[index % len(CLASSES)]
-        if clouds and rng.random() < self.share:
-            return self._seen(clouds[rng.integers(len(clouds))], rng)
-        return super().__getitem__(index)
+        simulated = clouds and rng.random() < self.share
+        sample = self._seen(clouds[rng.integers(len(clouds))], rng) if simulated else super().__getitem__(index)
+        vary = self.settings.vary_clouds and not self.settings.box_frame
+        return self._soiled(sample, rng) if vary and rng.random() < BORROWED_SHARE else sample
+
+    def _soiled(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        """A sample with the strays of another drive-by about the middle of its object."""
+        other, points = int(rng.integers(len(self.clouds))), len(sample.partial)
+        if other not in self._strays:
+            self._strays[other] = self._strays_of(self.clouds[other])
+        most = self.settings.max_points - points
+        added = borrowed(points, self._strays[other], len(self.clouds[other]), most, rng) + _foot(sample.truth)
+        power_db = None if sample.power_db is None else np.pad(sample.power_db, (0, len(added)))
+        return replace(sample, partial=np.concatenate([sample.partial, added]), power_db=power_db)
+
+    def _strays_of(self, cloud: Cloud) -> Float32:
+        """Strays [k, 3] along the line of sight, from the spot on the ground under the middle of the object."""
+        mesh = self._checked_mesh(cloud.object)
+        rng = np.random.default_rng(len(cloud))
+        surface = sample_surface(mesh.vertices, mesh.faces, _SURFACE_POINTS, rng)
+        surface = np.asarray(surface @ cloud.rotation.T + cloud.translation_m, np.float32)
+        bearing = bearing_rad(cloud.object, cloud.sensor_m, cloud.xyz_m)
+        return turned(strays(cloud.xyz_m, surface) - _foot(surface), -bearing)
 
     def _seen(self, cloud: Cloud, rng: np.random.Generator) -> Sample:
         """A cloud and its truth."""
@@ -155,6 +184,13 @@ class SimulatedDataset(CompletionDataset):
                 action="use the object library that the set was made with",
             )
         return mesh
+
+
+def _foot(truth: Float32) -> Float32:
+    """Spot [3] on the ground, z = 0, under the middle of an object [n, 3]."""
+    foot: Float32 = (truth.max(axis=0) + truth.min(axis=0)) / 2
+    foot[2] = 0
+    return foot
 
 
 def _usable(cloud: Cloud) -> bool:

@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.frames import Float32
+from train.nearest import nearest_index
 
-__all__ = ["STRETCH_SIGMA", "hidden", "stretch", "window", "with_strays"]
+__all__ = ["STRETCH_SIGMA", "borrowed", "hidden", "strays", "stretch", "window", "with_strays"]
 
 LEAST_FRAMES = 12
 HIDDEN_RADIUS_SHARE = (0.1, 0.35)
 STRETCH_SIGMA = (0.06, 0.04, 0.05)
 """Along, across and up; those of the scans of cars (``objects.deform``)."""
 STRAY_SHARE = (0.005, 0.1)
+STRAY_M = 0.4
+"""A point farther from the surface is no point of the object: wrongly associated, a side lobe, a ghost."""
 _MARGIN_M = 0.5
 _GROUND_SIGMA_M = 0.1
 
@@ -82,6 +85,23 @@ def with_strays(cloud: Float32, most: int, rng: np.random.Generator) -> Float32:
         image[:, 2] = rng.normal(0, _GROUND_SIGMA_M, len(image)) - image[:, 2]
         added.append(image)
     return np.concatenate(added)[:most].astype(np.float32)
+
+
+def strays(cloud: Float32, surface: Float32) -> Float32:
+    """Points of a cloud [n, 3] that lie more than ``STRAY_M`` from the object's surface, sampled as [m, 3]: [k, 3]."""
+    nearest = surface[nearest_index(np.ascontiguousarray(cloud), np.ascontiguousarray(surface))]
+    return np.asarray(cloud[((cloud - nearest) ** 2).sum(axis=1) > STRAY_M**2], np.float32)
+
+
+def borrowed(points: int, stray: Float32, of: int, most: int, rng: np.random.Generator) -> Float32:
+    """Strays of another cloud for this one, in the share that the other had.
+
+    Args:
+        points: of this cloud. stray: float32 [k, 3], of a cloud of ``of`` points. most: points of the result at most.
+    Returns:
+        float32 [<= k, 3], each of ``stray`` once at most, in random order.
+    """
+    return rng.permutation(stray)[: min(most, math.ceil(len(stray) / of * points))]
 
 
 def _strays(points: int, rng: np.random.Generator) -> int:

@@ -18,7 +18,8 @@ from train.nearest import nearest_distance
 from train.objects.mesh import MeshError
 from train.objects.reference import ObjectRef
 from train.simulate.build import build, export_clouds, shard_name
-from train.simulate.shards import Shard, encode, read_shard
+from train.simulate.shards import Cloud, Shard, encode, read_shard
+from train.simulate.work import Item
 from train.simulated import SimulatedDataset
 
 SETTINGS = DatasetSettings(truth_points=2000, epoch_samples=40, neighbour_probability=0.0)
@@ -129,6 +130,38 @@ def test_a_varied_cloud_still_lies_on_its_truth(folder: Path) -> None:
                 np.testing.assert_allclose(np.ptp(sample.truth, axis=0), sample.size_m, rtol=0.1)
         assert 5 <= stretched <= 19
         assert far <= 8
+
+
+def soiled_cloud(item: Item) -> Cloud:
+    """30 more points in a clump two metres behind the object, as seen from the radar, and 2.5 m above the ground."""
+    cloud = fake_cloud(item)
+    middle_m = cloud.translation_m + np.array([0, 0, 2.5])
+    away = cloud.xyz_m.mean(axis=0)[:2] - cloud.sensor_m[:2]
+    middle_m[:2] += 2 * away / np.linalg.norm(away)
+    clump = np.random.default_rng(item.seed).normal(middle_m, 0.05, (30, 3))
+    return replace(
+        cloud,
+        xyz_m=np.concatenate([cloud.xyz_m, clump]).astype(np.float32),
+        power_db=np.pad(cloud.power_db, (0, 30)),
+        frame_number=np.pad(cloud.frame_number, (0, 30), mode="edge"),
+    )
+
+
+def test_strays_of_other_drive_bys_lie_where_they_lay(tmp_path: Path) -> None:
+    build(small_plan(objects=12, drive_bys=4), tmp_path / "set", Here(), soiled_cloud)
+    found, most = 0, 0.0
+    for box_frame in (False, True):
+        dataset = SimulatedDataset(tmp_path / "set", "train", replace(EXACT, box_frame=box_frame), 3, 0.0)
+        for index in range(40):
+            sample = dataset[index]
+            middle = (sample.truth.max(axis=0) + sample.truth.min(axis=0)) / 2
+            place = np.array([middle[0] + 2, middle[1], 2.5])
+            strays = np.linalg.norm(sample.partial - place, axis=1) < 0.6
+            assert not (box_frame and strays.any())
+            found += bool(strays.any())
+            most = max(most, float(strays.mean()))
+    assert 4 <= found <= 20
+    assert 0.05 < most < 0.12, "30 of 330 points of the other cloud"
 
 
 def test_splits_hold_their_own_objects(folder: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from train import vary_cloud
-from train.vary_cloud import hidden, stretch, window, with_strays
+from train.vary_cloud import borrowed, hidden, strays, stretch, window, with_strays
 
 
 @pytest.mark.parametrize("frames", [1, 5, 12, 13, 400])
@@ -59,3 +59,22 @@ def test_strays_come_after_the_points_and_images_below_the_ground() -> None:
     assert 20 <= max(more) <= 40
     assert 70 <= below <= 130
     assert len(with_strays(cloud, 200, rng)) == 200
+
+
+def test_strays_are_what_lies_far_from_the_surface() -> None:
+    rng = np.random.default_rng(4)
+    surface = rng.uniform((-1, -1, 0), (1, 1, 0), (5000, 3)).astype(np.float32)
+    heights = np.array([0, 0.1, 0.3, 0.5, 2.0], np.float32)
+    cloud = np.column_stack([np.zeros((5, 2), np.float32), heights])
+    np.testing.assert_array_equal(strays(cloud, surface), cloud[3:])
+
+
+def test_borrowed_strays_keep_their_share() -> None:
+    rng = np.random.default_rng(5)
+    stray = rng.uniform(-1, 1, (40, 3)).astype(np.float32)
+    for points, most, expected in ((100, 2048, 10), (1, 2048, 1), (4000, 2048, 40), (400, 7, 7), (400, 0, 0)):
+        added = borrowed(points, stray, 400, most, rng)
+        assert len(added) == expected
+        assert len(np.unique(added, axis=0)) == expected
+        assert np.isin(added, stray).all()
+    assert borrowed(100, stray[:0], 400, 2048, rng).shape == (0, 3)
