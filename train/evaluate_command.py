@@ -145,7 +145,8 @@ def _bank(options: argparse.Namespace, source: str, box: bool) -> Bank | None:
     from train.dataset import CompletionDataset, DatasetSettings
     from train.simulated import SimulatedDataset
 
-    settings = DatasetSettings.default(box_frame=box, neighbour_probability=0.0)  # shapes stand about their own clouds
+    # no neighbours and no added strays: shapes stand about their own clouds
+    settings = DatasetSettings.default(box_frame=box, neighbour_probability=0.0, vary_clouds=False)
     if source == "scans":
         return Bank(CompletionDataset("train", settings, 1), options.bank)
     return Bank(SimulatedDataset(options.simulated, "train", settings, 1), options.bank)
