@@ -102,6 +102,7 @@ class Trainer:
     @staticmethod
     def _load_start(network: CompletionModel, path: Path) -> int:
         """Averaged weights of another run, or those of a shipped model; returns the samples it had seen."""
+        trim = 0
         if path.is_dir() or path.suffix == ".onnx":
             weights, samples = read_weights(path, network)
             kind = "a model's graph"
@@ -109,6 +110,7 @@ class Trainer:
             earlier = load_checkpoint(path)
             weights, kind = earlier.average, earlier.settings.get("network", "ours")
             samples = earlier.samples + int(earlier.settings.get("samples_before", 0))
+            trim = int(earlier.settings.get("options", {}).get("trim", 0))  # no weight tells
         refusal = ModelError(
             f"{path}: weights of another network",
             value=kind,
@@ -118,7 +120,8 @@ class Trainer:
             found = network.load_state_dict(weights, strict=False)
         except RuntimeError as error:
             raise refusal from error
-        if found.unexpected_keys or not network.begin_without(found.missing_keys):
+        fits = trim in (0, network.trim_percent) and not found.unexpected_keys
+        if not fits or not network.begin_without(found.missing_keys):
             raise refusal
         return samples
 

@@ -31,8 +31,8 @@ def read_weights(path: Path, network: CompletionModel) -> tuple[dict[str, torch.
 
     Args:
         path: model folder, or its fp32 ``.onnx`` file.
-        network: of the same kind and width, without attention, power and ground. What the graph does not have (options
-            that the exported network was trained without) is left out of the result.
+        network: of the same kind and width, without attention, power and ground, with the graph's ``trim``. What the
+            graph does not have (options that the exported network was trained without) is left out of the result.
     Returns:
         Parameter name -> tensor, and the samples that the model had seen (0: its manifest does not say).
     Raises:
@@ -42,6 +42,8 @@ def read_weights(path: Path, network: CompletionModel) -> tuple[dict[str, torch.
     try:
         graph = onnx.load(file).graph
         arrays = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
+        if (trim := _trim_percent(graph, arrays)) not in (0, network.trim_percent):
+            raise KeyError(f"trim={trim}")
         weights = _Reader(arrays, network).read()
         expected = network.state_dict()
         result = {name: torch.from_numpy(np.array(value, np.float32)) for name, value in weights.items()}
@@ -56,6 +58,13 @@ def read_weights(path: Path, network: CompletionModel) -> tuple[dict[str, torch.
             action="name the network, width and options of that model (its card names them)",
         ) from error
     return result, _samples(file.with_name("manifest.json"))
+
+
+def _trim_percent(graph: onnx.GraphProto, arrays: Arrays) -> int:
+    """What the graph's centre leaves out at each end (``export``), which no weight tells; 0: nothing."""
+    bodies = [a.g for node in graph.node for a in node.attribute if a.HasField("g")]
+    found = [node.input[1] for part in (graph, *bodies) for node in part.node if node.name == "left_out_percent"]
+    return int(arrays[found[0]].item()) if found else 0
 
 
 def _samples(manifest: Path) -> int:

@@ -79,9 +79,9 @@ def with_strays(cloud: Float32, most: int, rng: np.random.Generator) -> Float32:
     if around:
         low, high = cloud.min(axis=0) - _MARGIN_M, cloud.max(axis=0) + _MARGIN_M
         low[2] = max(low[2], 0.0)
-        added.append(rng.uniform(low, high, (_strays(len(cloud), rng), 3)).astype(np.float32))
+        added.append(rng.uniform(low, high, (_stray_count(len(cloud), rng), 3)).astype(np.float32))
     if below:
-        image = cloud[rng.integers(len(cloud), size=_strays(len(cloud), rng))].copy()
+        image = cloud[rng.integers(len(cloud), size=_stray_count(len(cloud), rng))].copy()
         image[:, 2] = rng.normal(0, _GROUND_SIGMA_M, len(image)) - image[:, 2]
         added.append(image)
     return np.concatenate(added)[:most].astype(np.float32)
@@ -104,5 +104,5 @@ def borrowed(points: int, stray: Float32, of: int, most: int, rng: np.random.Gen
     return rng.permutation(stray)[: min(most, math.ceil(len(stray) / of * points))]
 
 
-def _strays(points: int, rng: np.random.Generator) -> int:
+def _stray_count(points: int, rng: np.random.Generator) -> int:
     return math.ceil(points * math.exp(rng.uniform(*np.log(STRAY_SHARE))))

@@ -112,13 +112,15 @@ def test_fine_tuning_begins_with_the_averaged_weights_of_another_run(
     assert load_checkpoint(tmp_path / "second" / CHECKPOINT).settings["samples_before"] == first.state.samples
     with pytest.raises(ModelError, match="another network"):
         Trainer(replace(SETTINGS, network="pcn", width="tiny", start=str(path)), *data, tmp_path / "third")
-    options = {"mirror": "cue", "uncertainty": True}
+    options = {"mirror": "cue", "uncertainty": True, "trim": 5}
     fourth = Trainer(replace(SETTINGS, options=options, steps=1, start=str(path)), *data, tmp_path / "fourth")
     assert all(torch.equal(fourth.network.state_dict()[name], value) for name, value in first.average.items())
     fourth.run()
     back = str(tmp_path / "fourth" / CHECKPOINT)
     with pytest.raises(ModelError, match="at least its options"):
         Trainer(replace(SETTINGS, start=back), *data, tmp_path / "fifth")
+    with pytest.raises(ModelError, match="at least its options"):  # the weights would fit, the centre does not
+        Trainer(replace(SETTINGS, options=options | {"trim": 0}, start=back), *data, tmp_path / "sixth")
 
 
 def test_schedule_rises_then_falls_to_the_final_rate() -> None:

@@ -68,6 +68,17 @@ def test_options_may_be_added_and_samples_are_counted(tmp_path: Path) -> None:
         torch.testing.assert_close(other(cloud, [100]).fine, network(cloud, [100]).fine, atol=1e-4, rtol=0)
 
 
+def test_another_centre_is_refused_unless_there_was_none(tmp_path: Path) -> None:
+    plain, trimmed = made("ours", "sight", {}), made("ours", "sight", {"trim": 5})
+    export(build(trimmed), tmp_path / FULL)
+    assert read_weights(tmp_path, trimmed)[1] == 0
+    for other in (plain, made("ours", "sight", {"trim": 4})):
+        with pytest.raises(ModelError, match="trim=5"):
+            read_weights(tmp_path, other)
+    export(build(plain), tmp_path / FULL)
+    read_weights(tmp_path, trimmed)
+
+
 def test_what_is_no_such_graph_is_refused(tmp_path: Path) -> None:
     network = made("ours", "sight", {})
     with pytest.raises(ModelError, match="no fp32 graph"):
