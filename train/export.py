@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 import onnx
-from onnx import helper
 
 from edge.errors import ModelError
 from edge.frames import Float32
-from train.graph import Graph, per_object
+from train.export_parts import Parts
+from train.export_queries import QueryBuilder
+from train.graph import per_object
 from train.network import CompletionModel, CompletionNetwork
 from train.networks.ours import OurNetwork, OurOptions
+from train.networks.queries import QueryNetwork
 from train.quantize import with_saturation_probe
 
 INT8_NODES = ("local1", "local2", "fold1_cells", "fold2", "fold3", "sigma_log")
@@ -30,7 +32,7 @@ def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
     the encoder's last weight is a constant, and so is the patch term.
 
     Args:
-        network: ``paper``, ``pcn`` or ``ours`` of ``networks.registry``, with any options.
+        network: ``paper``, ``pcn``, ``ours`` or ``queries`` of ``networks.registry``, with any options.
         classifier: whether the graph gives classes; the paper's network has its classifier in training only.
     Returns:
         Model with input ``points`` float32 [n, columns] metres, n >= 1 free, and outputs ``fine`` float32 [fine, 3] and
@@ -39,9 +41,14 @@ def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
     Raises:
         ModelError: a network of another kind.
     """
+    if isinstance(network, QueryNetwork):
+        return QueryBuilder(network).model()
     if not isinstance(network, CompletionNetwork):
         raise ModelError(
-            "this network has no edge graph", value=type(network).__name__, allowed="paper, pcn, ours", action="choose"
+            "this network has no edge graph",
+            value=type(network).__name__,
+            allowed="paper, pcn, ours, queries",
+            action="choose",
         )
     return _Builder(network).model(classifier and network.classes > 0)
 
@@ -54,13 +61,14 @@ def export(model: onnx.ModelProto, path: Path) -> None:
     onnx.save(with_saturation_probe(whole) if coded else whole, path)
 
 
-class _Builder:
+class _Builder(Parts):
     """The layers of one network; method by method what ``network`` and ``networks.ours`` compute."""
 
+    network: CompletionNetwork
+
     def __init__(self, network: CompletionNetwork) -> None:
-        self.network, self.graph, self.scale = network, Graph(), np.float32(network.scale)
+        super().__init__(network)
         self.options = network.options if isinstance(network, OurNetwork) else OurOptions(coarse=network.coarse_points)
-        self.weights = {name: value.detach().cpu().float().numpy() for name, value in network.state_dict().items()}
         self.channels, self.width = network.width.local[1], network.width.fold
         self.count, self.cells = network.coarse_points, network.cells
 
@@ -87,40 +95,6 @@ class _Builder:
             graph.view("sigma_column", [fine], "sigma")
             outputs["sigma"] = (fine,)
         return graph.model(outputs, self.network.columns)
-
-    def _layer(self, name: str, source: str) -> str:
-        return self.graph.linear(source, self.weights[f"{name}.weight"], self.weights.get(f"{name}.bias"), name)
-
-    def _center(self) -> None:
-        """Points about their centre, "centered" [n, 3]; the centre is 0 in the box, in sight the middle in x and y.
-
-        "low" and "high" are the ends of the bounding box.
-        """
-        graph, sight = self.graph, self.network.frame == "sight"
-        places = "points"
-        if self.network.columns > 3:
-            places = graph.add("Slice", ["points", *(graph.integers(n) for n in (0, 3, 1))], "places")
-        graph.add("ReduceMax", [places, graph.integers(0)], "high", keepdims=1)
-        graph.add("ReduceMin", [places, graph.integers(0)], "low", keepdims=1)
-        low, high = self._trimmed(places) if self.network.trim_percent else ("low", "high")
-        graph.add("Add", [high, low], "both_ends")
-        half = np.array([[0.5, 0.5, 0.0]], np.float32) * sight
-        graph.add("Mul", ["both_ends", graph.constant("half", half)], "center")
-        graph.add("Sub", [places, "center"], "centered")
-
-    def _trimmed(self, places: str) -> tuple[str, str]:
-        """Ends [1, 3] of what ``train.network.middle`` leaves of every axis."""
-        graph = self.graph
-        count = graph.add("Shape", [places], "places_count", start=0, end=1)
-        last = graph.add("Sub", [count, graph.integers(1)], "places_last")
-        percent = graph.add("Mul", [last, graph.integers(self.network.trim_percent)], "left_out_percent")
-        low = graph.add("Div", [percent, graph.integers(100)], "left_out")
-        high = graph.add("Sub", [last, low], "left_in")
-        graph.nodes.append(
-            helper.make_node("TopK", [places, count], ["ordered", "order"], name="ordered", axis=0, largest=0)
-        )
-        ends = (graph.add("Gather", ["ordered", row], f"{row}_end", axis=0) for row in (low, high))
-        return next(ends), next(ends)
 
     def _inputs(self) -> str:
         """Coordinates and what the options add, scaled in the first layer's weight."""
@@ -228,7 +202,7 @@ class _Builder:
         shared = self._layer("token_global", feature)
         tokens = graph.add("Add", [own, graph.add("Add", [place, shared], "token_shared")], "tokens")
         for number in range(len(self.network.token_blocks)):  # type: ignore[arg-type]
-            tokens = self._block(f"token_blocks.{number}", tokens, len(anchors))
+            tokens = self._block(f"token_blocks.{number}", tokens)
         graph.add("ReduceMax", [tokens, graph.integers(0)], "tokens_high", keepdims=1)
         return self._layer("token_out", "tokens_high")
 
@@ -241,53 +215,24 @@ class _Builder:
         tokens = graph.add("Add", [graph.linear(coarse, weight, bias, "coarse_in"), own], "coarse_tokens")
         step = self.count // LANDMARKS
         marks = [graph.integers(0), graph.integers(self.count), graph.integers(0), graph.integers(step)]
-        return self._block("coarse_block", tokens, self.count, graph.add("Slice", [tokens, *marks], "landmarks"))
+        return self._block("coarse_block", tokens, graph.add("Slice", [tokens, *marks], "landmarks"))
 
-    def _block(self, name: str, tokens: str, count: int, memory: str = "") -> str:
-        """A transformer block (``networks.attention.Block``) over [count, channels]."""
+    def _block(self, name: str, tokens: str, memory: str = "") -> str:
+        """A transformer block (``networks.attention.Block``) over [n, channels]."""
         block: Any = self.network.get_submodule(name)
         graph, heads = self.graph, int(block.attention.heads)
         normal = self._norm(f"{name}.before", tokens, f"{name}.normal")
         seen = self._norm(f"{name}.before", memory, f"{name}.seen") if memory else normal
-        depth = self.width // heads
-        key_value = self.weights[f"{name}.attention.key_value.weight"]
-        query = self.weights[f"{name}.attention.query.weight"] / np.sqrt(np.float32(depth))
-        parts = {}
-        for part, source, weight, order in (
-            ("query", normal, query, [1, 0, 2]),
-            ("key", seen, key_value[: self.width], [1, 2, 0]),
-            ("value", seen, key_value[self.width :], [1, 0, 2]),
-        ):
-            flat = graph.linear(source, weight, None, f"{name}.{part}")
-            split = graph.view(flat, [-1, heads, depth], f"{name}.{part}_heads")
-            parts[part] = graph.add("Transpose", [split], f"{name}.{part}_turned", perm=order)
-        score = graph.add("MatMul", [parts["query"], parts["key"]], f"{name}.score")
-        share = graph.add("Softmax", [score], f"{name}.share", axis=-1)
-        mixed = graph.add("MatMul", [share, parts["value"]], f"{name}.mixed")
-        turned = graph.add("Transpose", [mixed], f"{name}.mixed_turned", perm=[1, 0, 2])
-        flat = graph.view(turned, [count, self.width], f"{name}.mixed_flat")
-        attended = graph.add("Add", [tokens, self._layer(f"{name}.attention.output", flat)], f"{name}.attended")
+        mixed = self._attend(f"{name}.attention", normal, seen, heads)
+        attended = graph.add("Add", [tokens, mixed], f"{name}.attended")
         middle = self._norm(f"{name}.middle", attended, f"{name}.middle_normal")
         curved = graph.add("Gelu", [self._layer(f"{name}.mlp.0", middle)], f"{name}.curved")
         return graph.add("Add", [attended, self._layer(f"{name}.mlp.2", curved)], f"{name}.out")
 
-    def _norm(self, layer: str, source: str, output: str) -> str:
-        names = [self.graph.constant(f"{layer}.{part}", self.weights[f"{layer}.{part}"]) for part in ("weight", "bias")]
-        return self.graph.add("LayerNormalization", [source, *names], output, axis=-1, epsilon=1e-5)
-
     def _cue(self, coarse: str, hidden: str, rows: str, feature: str) -> list[str]:
         """``OurNetwork._cue``: two terms of the folding's first layer."""
-        graph, weights = self.graph, self.weights
-        weight, bias = weights["plane.weight"].copy(), weights["plane.bias"].copy()
-        weight[2], bias[2] = weight[2] * self.scale, bias[2] * self.scale
-        graph.linear(feature, weight, bias, "plane")
-        raw = graph.add("Slice", ["plane", *(graph.integers(n) for n in (0, 2, 1))], "plane_raw")
-        length = graph.add("ReduceL2", [raw, graph.integers(1)], "plane_length", keepdims=1)
-        graph.add("Max", [length, graph.constant("least", np.full(1, 1e-12, np.float32))], "plane_divisor")
-        graph.add("Div", [raw, "plane_divisor"], "plane_unit")
-        zero = graph.constant("zero_column", np.zeros((1, 1), np.float32))
-        graph.add("Concat", ["plane_unit", zero], "plane_normal", axis=1)
-        graph.add("Slice", ["plane", *(graph.integers(n) for n in (2, 3, 1))], "plane_offset")
+        graph = self.graph
+        self._plane(feature)
         other = graph.nearest_rows(self._mirrored(coarse, "image"), self.count, "mirror_rows")
         here = graph.add("Gather", ["centered", rows], "nearest_points", axis=0)
         there = self._mirrored(graph.add("Gather", ["centered", other], "mirror_points", axis=0), "back")
@@ -296,18 +241,8 @@ class _Builder:
         of_mirror = graph.add("Gather", [hidden, other], "mirror_hidden", axis=0)
         return [
             self._layer("of_mirror", of_mirror),
-            graph.linear(both, weights["of_evidence.weight"] / self.scale, None, "of_evidence"),
+            graph.linear(both, self.weights["of_evidence.weight"] / self.scale, None, "of_evidence"),
         ]
-
-    def _mirrored(self, points: str, output: str) -> str:
-        """Mirror image about the plane; [n, 3]."""
-        graph = self.graph
-        graph.add("Gemm", [points, "plane_normal"], f"{output}_along", transB=1)
-        graph.add("Sub", [f"{output}_along", "plane_offset"], f"{output}_distance")
-        two = graph.constant("two", np.array(2, np.float32))
-        twice = graph.add("Mul", [f"{output}_distance", two], f"{output}_two")
-        return graph.add("Sub", [points, graph.add("Mul", [twice, "plane_normal"], f"{output}_step")], output)
-
 
 def example_input(network: CompletionModel, points: int = 64) -> Float32:
     """A cloud of the network's columns, for checks: float32 [points, columns]."""

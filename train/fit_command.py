@@ -42,6 +42,7 @@ def add_verb(verbs: Any) -> None:
     fit.add_argument("--cells", type=int, default=4, help="of 16 shares of the fine cloud, how many in a step")
     fit.add_argument("--average", type=float, default=0.999, help="decay of the averaged weights")
     fit.add_argument("--emd-points", type=int, default=512, help="points that are matched")
+    fit.add_argument("--fine-emd", type=float, default=0.0, metavar="W", help="weight of it for adapointr and queries")
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     fit.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of the inner layers")
@@ -58,8 +59,9 @@ def add_verb(verbs: Any) -> None:
 
 def _add_what(fit: argparse.ArgumentParser) -> None:
     """Which network and which data."""
-    fit.add_argument("--network", default="ours", help="ours, paper, pcn or adapointr")
-    fit.add_argument("--width", default="", help="edge, paper, wide, tiny; adapointr: full, small, tiny")
+    fit.add_argument("--network", default="ours", help="ours, queries, paper, pcn or adapointr")
+    widths = "edge, paper, wide, tiny; queries: edge, tiny; adapointr: full, small, tiny"
+    fit.add_argument("--width", default="", help=widths)
     fit.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="of the network; repeatable")
     fit.add_argument("--frame", choices=("sight", "box"), default="sight", help="line of sight in metres, or box prior")
     fit.add_argument("--data", choices=("ours", "pcn"), default="ours", help="radar-like, or clean depth scans")
@@ -81,6 +83,7 @@ def _fit(options: argparse.Namespace) -> int:
     loss = LossSettings(
         squared=options.squared,
         emd_points=options.emd_points,
+        fine_emd=options.fine_emd,
         joint=options.joint_uncertainty,
         class_weights=_class_weights(options.class_weight),
     )

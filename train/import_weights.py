@@ -20,6 +20,7 @@ from onnx import numpy_helper
 from edge.errors import ModelError
 from train.network import CompletionModel, CompletionNetwork
 from train.networks.ours import OurNetwork
+from train.networks.queries import QueryNetwork
 
 PLAIN = ("point2", "coarse1", "coarse2", "fold2", "class1", "class2")
 """Layers that stand in the graph as they are."""
@@ -44,7 +45,8 @@ def read_weights(path: Path, network: CompletionModel) -> tuple[dict[str, torch.
         arrays = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
         if (trim := _trim_percent(graph, arrays)) not in (0, network.trim_percent):
             raise KeyError(f"trim={trim}")
-        weights = _Reader(arrays, network).read()
+        reader = _QueryReader if isinstance(network, QueryNetwork) else _Reader
+        weights = reader(arrays, network).read()
         expected = network.state_dict()
         result = {name: torch.from_numpy(np.array(value, np.float32)) for name, value in weights.items()}
         wrong = [name for name, value in result.items() if name not in expected or expected[name].shape != value.shape]
@@ -54,7 +56,7 @@ def read_weights(path: Path, network: CompletionModel) -> tuple[dict[str, torch.
         raise ModelError(
             f"{path}: no fp32 graph of this network",
             value=f"{type(error).__name__}: {error}",
-            allowed="a model folder written by 'rfconstruct-train export', network ours, pcn or paper, same width",
+            allowed="a model folder that 'rfconstruct-train export' wrote, not of adapointr, same network and width",
             action="name the network, width and options of that model (its card names them)",
         ) from error
     return result, _samples(file.with_name("manifest.json"))
@@ -133,3 +135,31 @@ class _Reader:
             result |= self._layer("sigma_log", "sigma")
             result["sigma.bias"] = result["sigma.bias"] - np.log(self.scale)
         return result
+
+
+class _QueryReader:
+    """What ``export_queries`` writes: nearly every layer as it is, in network units."""
+
+    def __init__(self, arrays: Arrays, network: CompletionModel) -> None:
+        self.arrays, self.network, self.scale = arrays, network, np.float32(network.scale)
+
+    def read(self) -> Arrays:
+        """Everything; KeyError names a parameter that the graph lacks."""
+        parameters = self.network.state_dict()
+        return {name: self._one(name).astype(np.float32).reshape(parameters[name].shape) for name in parameters}
+
+    def _one(self, name: str) -> NDArray[np.float32]:
+        layer, _, kind = name.rpartition(".")
+        if layer.endswith("attention.query"):
+            heads = int(self.network.get_submodule(layer.removesuffix(".query")).heads)  # type: ignore[arg-type]
+            weight = self.arrays[name].T
+            return np.asarray(weight * np.sqrt(np.float32(weight.shape[0] // heads)))
+        if layer.endswith("attention.key_value"):
+            attention = layer.removesuffix("_value").removesuffix("key")
+            return np.concatenate([self.arrays[f"{attention}{part}.weight"].T for part in ("key", "value")])
+        if layer == "sigma":
+            value = self.arrays[f"sigma_log.{kind}"]
+            return np.asarray(value.T if kind == "weight" else value - np.log(self.scale))
+        moved = {"reduce.bias": "reduce_feature.bias", "rebuild1.bias": "top.bias"}
+        value = self.arrays[moved.get(name, name)]
+        return np.asarray(value.T if value.ndim == 2 else value)

@@ -38,6 +38,7 @@ class LossSettings:
             distances and the mean of both directions that its figures fit.
         emd_points: random points of both clouds that are matched.
         emd_tolerance: relative excess over the optimal matching that is accepted.
+        fine_emd: weight of the EMD of as many random fine points, for a network whose coarse cloud has none.
         beta: weight of the cross entropy.
         gamma: weight of the expected distance's log-likelihood, where the network gives one.
         joint: let that term move the points too (heteroscedastic Chamfer distance); else it only learns to expect.
@@ -51,6 +52,7 @@ class LossSettings:
     squared: bool = False
     emd_points: int = 512
     emd_tolerance: float = 0.05
+    fine_emd: float = 0.0
     beta: float = 0.02
     gamma: float = 0.002
     joint: bool = False
@@ -61,7 +63,7 @@ class LossSettings:
     def __post_init__(self) -> None:
         require(1 <= self.emd_points <= 1024, "loss.emd_points", self.emd_points, "1..1024")
         require(0 < self.emd_tolerance < 1, "loss.emd_tolerance", self.emd_tolerance, "0..1")
-        for name in ("beta", "gamma", "symmetry", "denoise"):
+        for name in ("fine_emd", "beta", "gamma", "symmetry", "denoise"):
             require(getattr(self, name) >= 0, f"loss.{name}", getattr(self, name), ">= 0")
         good = len(self.class_weights) in (0, len(CLASSES)) and all(weight > 0 for weight in self.class_weights)
         require(good, "loss.class_weights", self.class_weights, f"{len(CLASSES)} numbers > 0, or none")
@@ -154,6 +156,15 @@ def _matched(first: Tensor, second: Tensor, matcher: Matcher, tolerance: float, 
     return _length(first - take(second, matcher.assign(first, second, tolerance)), squared).mean(1)
 
 
+def _some_matched(
+    points: Tensor, truth: Tensor, settings: LossSettings, matcher: Matcher, generator: torch.Generator
+) -> Tensor:
+    """EMD of random ``emd_points`` of a cloud and as many of the truth: [b]."""
+    count = min(settings.emd_points, points.shape[1])
+    chosen = torch.randperm(points.shape[1], generator=generator)[:count].to(points.device)
+    return _matched(points[:, chosen], truth[:, :count], matcher, settings.emd_tolerance, settings.squared)
+
+
 @dataclass(frozen=True, slots=True)
 class LossTerms:
     """One step's losses; distances in network units.
@@ -199,12 +210,12 @@ def completion_loss(
     scale = network.scale if network else SCALE_M
     truth, coarse, fine = truth_m / scale, output.coarse / scale, output.fine / scale
     weights = settings.weights(labels)
-    count = min(settings.emd_points, coarse.shape[1])
-    chosen = torch.randperm(coarse.shape[1], generator=generator)[:count].to(coarse.device)
     if network and network.coarse_loss == "chamfer":
         coarse_loss = _joined(*two_ways(coarse, truth, matcher, settings.squared), settings.squared)
+        if settings.fine_emd:
+            coarse_loss = coarse_loss + settings.fine_emd * _some_matched(fine, truth, settings, matcher, generator)
     else:
-        coarse_loss = _matched(coarse[:, chosen], truth[:, :count], matcher, settings.emd_tolerance, settings.squared)
+        coarse_loss = _some_matched(coarse, truth, settings, matcher, generator)
     forth, back = two_ways(fine, truth, matcher, settings.squared)
     fine_loss = _joined(forth, back, settings.squared)
     label_loss = torch.zeros_like(fine_loss)

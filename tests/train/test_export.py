@@ -78,6 +78,8 @@ NETWORKS: list[tuple[str, Frame, dict[str, Option]]] = [
     ("ours", "sight", EVERYTHING),
     ("ours", "sight", {"mirror": "cue", "trim": 5}),
     ("ours", "sight", EVERYTHING | {"trim": 20}),
+    ("queries", "sight", {"trim": 5}),
+    ("queries", "box", {"mirror": False}),
 ]
 
 

@@ -36,6 +36,8 @@ def made(kind: str, frame: Frame, options: dict[str, Option], seed: int = 0) -> 
         ("ours", "sight", {"mirror": "cue", "uncertainty": True}),
         ("ours", "sight", {"mirror": "cue", "trim": 5}),
         ("ours", "box", {"mirror": "cue", "coarse": 512}),
+        ("queries", "sight", {"trim": 5}),
+        ("queries", "box", {"mirror": False}),
         ("pcn", "sight", {}),
         ("paper", "box", {}),
     ],
@@ -91,7 +93,7 @@ def test_what_is_no_such_graph_is_refused(tmp_path: Path) -> None:
         read_weights(tmp_path / "model.int8.onnx", network)
     export(build(network), tmp_path / FULL)
     torch.manual_seed(0)
-    with pytest.raises(ModelError, match="same width"):
+    with pytest.raises(ModelError, match="same network and width"):
         read_weights(tmp_path, registry.build("ours", "tiny", "sight", {}))
     with pytest.raises(ModelError, match="attention"):
         read_weights(tmp_path, registry.build("ours", "edge", "sight", {"attention": "tokens"}))

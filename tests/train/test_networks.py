@@ -22,6 +22,7 @@ EVERYTHING = {
 }  # fmt: skip
 CASES = [("paper", {}), ("pcn", {}), ("ours", {}), ("ours", EVERYTHING), ("adapointr", {})]
 CENTERED = [*CASES, ("ours", {"trim": 5})]
+QUERIES = [("queries", {}), ("queries", {"mirror": False, "denoise": False})]
 
 
 def network_of(name: str, options: dict[str, object]) -> CompletionModel:
@@ -58,7 +59,7 @@ def test_multiplications_equal_the_ones_derived_from_the_layers(name: str, macs:
     assert counter.get_total_flops() == 2 * (macs + again + own)
 
 
-@pytest.mark.parametrize(("name", "options"), CASES)
+@pytest.mark.parametrize(("name", "options"), [*CASES, *QUERIES])
 def test_sizes_gradients_and_order(name: str, options: dict[str, object]) -> None:
     network = network_of(name, options)
     for layer in network.modules() if options else ():  # what starts at zero hides what is behind it
@@ -70,7 +71,7 @@ def test_sizes_gradients_and_order(name: str, options: dict[str, object]) -> Non
     output = network(points, counts, torch.arange(network.cells // 4))
     assert output.coarse.shape == (3, network.coarse_points, 3)
     assert output.fine.shape == (3, FINE_POINTS // 4, 3)
-    assert output.logits.shape == (3, 4 if name in ("paper", "ours") else 0)
+    assert output.logits.shape == (3, 4 if name in ("paper", "ours", "queries") else 0)
     settings = LossSettings(emd_points=128)
     generator = torch.Generator().manual_seed(0)
     labels = torch.tensor([0, 1, 3])
@@ -174,8 +175,9 @@ def test_box_frame_is_neither_centred_nor_scaled() -> None:
         build("ours", "tiny", "box", {"ground": True})
 
 
-def test_noisy_queries_do_not_change_the_true_ones() -> None:
-    network, points = network_of("adapointr", {}), cloud(100, 3)
+@pytest.mark.parametrize("name", ["adapointr", "queries"])
+def test_noisy_queries_do_not_change_the_true_ones(name: str) -> None:
+    network, points = network_of(name, {}), cloud(100, 3)
     with torch.no_grad():
         training, answer = network.train()(points, [100]), network.eval()(points, [100])
     torch.testing.assert_close(training.fine, answer.fine, atol=1e-4, rtol=0)
@@ -222,4 +224,4 @@ def test_options_are_typed_and_the_unknown_is_refused() -> None:
     for arguments in (("ours", "huge"), ("nothing",), ("ours", "tiny", "sight", {"mirror": "always"})):
         with pytest.raises(ConfigError):
             build(*arguments)  # type: ignore[arg-type]
-    assert set(NETWORKS) == {"ours", "paper", "pcn", "adapointr"}
+    assert set(NETWORKS) == {"ours", "queries", "paper", "pcn", "adapointr"}

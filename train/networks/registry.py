@@ -11,6 +11,7 @@ from edge.config import require
 from train.network import WIDTHS, CompletionModel, CompletionNetwork, Frame
 from train.networks.adapointr import TRANSFORMER_WIDTHS, AdaPoinTr
 from train.networks.ours import OurNetwork, OurOptions
+from train.networks.queries import QUERY_WIDTHS, QueryNetwork, QueryOptions
 from train.objects.mesh import CLASSES
 
 if TYPE_CHECKING:
@@ -37,7 +38,9 @@ class Entry:
 
 
 _OPTIONS: dict[str, type] = {field.name: type(field.default) for field in fields(OurOptions)}
+_QUERY_OPTIONS: dict[str, type] = {field.name: type(field.default) for field in fields(QueryOptions)}
 NETWORKS = {
+    "queries": Entry(tuple(QUERY_WIDTHS), "edge", _QUERY_OPTIONS, "transformer for the edge, queries from the input"),
     "ours": Entry(tuple(WIDTHS), "edge", _OPTIONS, "narrow, line of sight, with the switches of --option"),
     "paper": Entry(tuple(WIDTHS), "paper", {}, "the paper's: local features, folding, classifier in training"),
     "pcn": Entry(tuple(WIDTHS), "paper", {}, "Point Completion Network: no local features, no classifier"),
@@ -88,8 +91,10 @@ def build(
     require(not unknown, f"option of network {name}", unknown, ", ".join(entry.options) or "none")
     if name == "adapointr":
         return AdaPoinTr(TRANSFORMER_WIDTHS[width], frame)
+    values: dict[str, Any] = chosen
+    if name == "queries":
+        return QueryNetwork(QUERY_WIDTHS[width], len(CLASSES), frame, QueryOptions(**values))
     if name == "ours":
-        values: dict[str, Any] = chosen
         return OurNetwork(WIDTHS[width], len(CLASSES), frame, OurOptions(**values))
     return CompletionNetwork(WIDTHS[width], len(CLASSES) if name == "paper" else 0, frame, local=name == "paper")
 

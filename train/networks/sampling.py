@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sampling of well spread points without a loop over them, for graphs in which a loop is dear."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+GOLDEN = (5**0.5 - 1) / 2
+
+
+@lru_cache(maxsize=8)
+def order(size: int) -> tuple[int, ...]:
+    """A permutation of ``size`` places of which every beginning is spread evenly over them (golden ratio)."""
+    return tuple(np.argsort(np.arange(size) * GOLDEN % 1.0, kind="stable").tolist())
+
+
+def shuffled(points: Tensor, counts: Sequence[int], size: int) -> tuple[Tensor, Tensor]:
+    """Clouds of different sizes as one tensor, in ``order``: small ones repeated, large ones thinned evenly.
+
+    Args:
+        points: [sum(counts), 3].
+        counts: points of each cloud.
+        size: points of each afterwards.
+    Returns:
+        [b, size, 3], and bool [b, size]: False for a point that repeats another.
+    """
+    step = torch.tensor(order(size), device=points.device)
+    offset, rows, first = 0, [], []
+    for count in counts:
+        rows.append((step % count if count <= size else step * count // size) + offset)
+        first.append(step < count)
+        offset += count
+    return points[torch.stack(rows)], torch.stack(first)
+
+
+@torch.no_grad()
+def spread(points: Tensor, first: Tensor, count: int) -> Tensor:
+    """The ``count`` points with the largest distance to all points before them, the largest first.
+
+    Any two of them are at least as far apart as the smallest of these distances, and every other point has an earlier
+    one nearer than that. In an order without system this is nearly farthest-point sampling (Eldar et al. 1997), in
+    which the order is part of what is looked for, and each point has to wait for the one before it. A beginning of the
+    answer is a coarser sampling.
+
+    Args:
+        points: [b, n, 3].
+        first: bool [b, n], False for a point that repeats another, True for the first of all; repetitions count for
+            nothing and come last, in their order.
+        count: at most n.
+    Returns:
+        int64 [b, count].
+    """
+    size = points.shape[1]
+    norms = points.square().sum(-1)
+    later = torch.full((size, size), float("inf"), dtype=points.dtype, device=points.device).triu()
+    others = norms + torch.where(first, 0.0, float("inf")).to(points.dtype)
+    own = torch.cat([-2 * points, torch.ones_like(norms)[..., None]], -1)
+    nearest = torch.baddbmm(later, own, torch.cat([points, others[..., None]], -1).mT).amin(2) + norms
+    last = -torch.arange(1, size + 1, dtype=points.dtype, device=points.device)
+    nearest = torch.where(first, nearest, last)
+    return nearest.topk(count, dim=1).indices
