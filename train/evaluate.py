@@ -23,7 +23,19 @@ from train.metrics import Summary, shape_metrics, summarize
 from train.network import Frame
 from train.predictors import Answer, Predictor, box_unit
 
-__all__ = ["BIKE", "FLOOR", "MACRO", "PAPER", "OnnxModel", "Scores", "evaluate", "int8_is_good", "measure", "spread"]
+__all__ = [
+    "BIKE",
+    "FLOOR",
+    "MACRO",
+    "PAPER",
+    "OnnxModel",
+    "Scores",
+    "evaluate",
+    "int8_is_faster",
+    "int8_is_good",
+    "measure",
+    "spread",
+]
 
 MACRO = "macro"
 BIKE = "bike"
@@ -224,6 +236,12 @@ def _shifts(models: dict[str, OnnxModel], dataset: CompletionDataset, indices: l
         for name, fine in answers.items():
             shifts[name].append(100 * float(np.sqrt(np.square(fine - reference).sum(axis=1).mean())))
     return shifts
+
+
+def int8_is_faster(scores: dict[str, Scores], full: str, small: str, share: float = 0.9) -> bool:
+    """True when the small model's median time is at most ``share`` of the full one's; else its error buys nothing."""
+    before, after = (float(np.median(scores[name].values["time_ms"])) for name in (full, small))
+    return after <= share * before
 
 
 def int8_is_good(scores: dict[str, Scores], full: str, small: str, limit: float = 0.01) -> bool:

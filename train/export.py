@@ -19,7 +19,7 @@ from train.networks.ours import OurNetwork, OurOptions
 from train.networks.queries import QueryNetwork
 from train.quantize import with_saturation_probe
 
-INT8_NODES = ("local1", "local2", "fold1_cells", "fold2", "fold3", "sigma_log")
+INT8_NODES = ("local1", "local2", "fold1_cells", "fold2", "fold3", "sigma_log", "group", "rebuild1", "rebuild2")
 """Nodes that compute per input point or per fine point on features: nearly all of the time, and fit for eight bits.
 Coordinates, layers of one row and of one row per coarse point stay in float."""
 

@@ -111,13 +111,14 @@ def _measure(options: argparse.Namespace, checkpoint: Checkpoint, network: Compl
     from train.baselines import Bank
     from train.card import write_card
     from train.dataset import CLASSES, CompletionDataset, DatasetSettings
-    from train.evaluate import OnnxModel, evaluate, int8_is_good
+    from train.evaluate import OnnxModel, evaluate, int8_is_faster, int8_is_good
     from train.manifest import FULL, SMALL, write_golden, write_manifest
 
     models = {name: OnnxModel(folder / name, network.frame) for name in (FULL, SMALL)}
     sets = _sets(options, network, "val")
     gates = [evaluate(models, data, options.samples, 0, threads=options.threads) for data in sets]
-    default = SMALL if all(int8_is_good(gate, FULL, SMALL) for gate in gates) else FULL
+    pays = int8_is_faster(gates[0], FULL, SMALL) and all(int8_is_good(gate, FULL, SMALL) for gate in gates)
+    default = SMALL if pays else FULL
     settings = DatasetSettings.default(box_frame=network.frame == "box", neighbour_probability=0.0)
     bank = Bank(CompletionDataset("train", settings, 1), options.bank) if options.bank else None
     test = _sets(options, network, "test")[0]

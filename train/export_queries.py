@@ -11,8 +11,6 @@ from train.export_parts import Parts
 from train.networks.queries import QueryNetwork
 from train.networks.sampling import order
 
-INT8_NODES = ("group", "rebuild1", "rebuild2")
-"""Nodes that are fit for eight bits."""
 _FAR = 1e6
 _KIND = 3
 """Columns of a query's position, before those of its kind."""

@@ -196,19 +196,22 @@ class _Rewriter:
         made = self._range(target) if self._coded(target) else None
         gain = 1.0 if made is None else made.gain.astype(np.float64)
         weight = self.weights[node.input[1]].astype(np.float64) * source.gain[:, None] / gain
-        scale = np.maximum(np.abs(weight).max(axis=0), 1e-12) / self.limit
-        codes = np.clip(np.rint(weight / scale), -self.limit, self.limit).astype(np.int8)
         add, name = self.graph.constant, node.name
+        scale = np.maximum(np.abs(weight).max(axis=0), 1e-12) / self.limit
+        bias = self.weights.get(node.input[2])
+        if bias is not None:  # its code has 32 bits; of a channel nearly without weights it would need more
+            right = (bias - self.errors.get(name, 0.0)) / gain
+            scale = np.maximum(scale, np.abs(right) / (source.step * 2.0**30))
+        codes = np.clip(np.rint(weight / scale), -self.limit, self.limit).astype(np.int8)
         inputs = [*self._with_scale(source), add(f"{name}.w_code", codes)]
         inputs += [add(f"{name}.w_scale", scale.astype(np.float32)), self._zeros(len(scale))]
-        steps, bias = source.step * scale, self.weights.get(node.input[2])
+        steps = source.step * scale
         if bias is None:
             step = add(f"{name}.step", (steps * gain).astype(np.float32))
             divided = self.graph.add("Div", [node.input[2], step], f"{name}.b")
             rounded = self.graph.add("Round", [divided], f"{name}.b_round")
             inputs.append(self.graph.add("Cast", [rounded], f"{name}.b_code", to=onnx.TensorProto.INT32))
         else:
-            right = (bias - self.errors.get(name, 0.0)) / gain
             inputs.append(add(f"{name}.b_code", np.rint(right / steps).astype(np.int32)))
         if made is None:
             self.graph.add("QGemm", inputs, target, domain=_MICROSOFT)

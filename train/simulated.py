@@ -29,7 +29,7 @@ WINDOW_SHARE, HIDDEN_SHARE, STRETCH_SHARE, STRAY_SHARE = 0.3, 0.3, 0.5, 0.2
 BORROWED_SHARE = 0.3
 """Chance of the strays of another drive-by, for scans too."""
 _SURFACE_POINTS = 2048
-_VARIATION = 2
+_VARIATION = 3
 """Of the ways in which clouds are varied: a run is continued with those that it began with."""
 _SIZE_TOLERANCE_M = 2e-3
 _OWN = 1

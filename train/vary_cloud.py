@@ -18,7 +18,7 @@ from train.nearest import nearest_index
 
 __all__ = ["STRETCH_SIGMA", "borrowed", "hidden", "strays", "stretch", "window", "with_strays"]
 
-LEAST_FRAMES = 12
+LEAST_FRAMES, BEGINNING_SHARE = 12, 0.5
 HIDDEN_RADIUS_SHARE = (0.1, 0.35)
 STRETCH_SIGMA = (0.06, 0.04, 0.05)
 """Along, across and up; those of the scans of cars (``objects.deform``)."""
@@ -30,7 +30,9 @@ _GROUND_SIGMA_M = 0.1
 
 
 def window(frame_number: NDArray[np.int64], frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Points of a shorter window: frames in a row, log-uniform in number, anywhere in the long one.
+    """Points of a shorter window: frames in a row, log-uniform in number, anywhere or from the beginning.
+
+    The beginning, what is known of an object while it comes nearer, is what the vehicle asks about first.
 
     Args:
         frame_number: int64 [n], from 0. frames: of the whole window, >= 1.
@@ -39,7 +41,7 @@ def window(frame_number: NDArray[np.int64], frames: int, rng: np.random.Generato
     """
     least = min(LEAST_FRAMES, frames)
     count = round(math.exp(rng.uniform(math.log(least), math.log(frames))))
-    first = int(rng.integers(frames - count + 1))
+    first = 0 if rng.random() < BEGINNING_SHARE else int(rng.integers(frames - count + 1))
     return np.asarray((frame_number >= first) & (frame_number < first + count))
 
 

@@ -14,7 +14,19 @@ import torch
 from edge.errors import ConfigError, ModelError
 from train.baselines import Bank, collapse, input_itself
 from train.dataset import CLASSES, CompletionDataset, DatasetSettings, Sample
-from train.evaluate import BIKE, FLOOR, MACRO, PAPER, Scores, evaluate, int8_is_good, measure, spread, table
+from train.evaluate import (
+    BIKE,
+    FLOOR,
+    MACRO,
+    PAPER,
+    Scores,
+    evaluate,
+    int8_is_faster,
+    int8_is_good,
+    measure,
+    spread,
+    table,
+)
 from train.held_out import Case, HeldOut
 from train.network import Completion, CompletionModel, Frame
 from train.predictors import Answer, EdgePredictor, TorchPredictor
@@ -74,6 +86,15 @@ def test_gate_looks_at_every_class() -> None:
     full = made([10, 10, 5, 5])
     assert int8_is_good({"f": full, "s": made([10.1, 10.05, 5, 5])}, "f", "s")
     assert not int8_is_good({"f": full, "s": made([9, 9, 5.1, 5.1])}, "f", "s")
+
+
+def test_eight_bits_must_be_a_tenth_faster() -> None:
+    def lasting(times_ms: list[float]) -> Scores:
+        return Scores({"time_ms": times_ms}, [str(i) for i in range(4)], [0, 0, 1, 1])
+
+    full = lasting([10, 10, 10, 50])
+    assert int8_is_faster({"f": full, "s": lasting([8, 9, 9, 100])}, "f", "s")
+    assert not int8_is_faster({"f": full, "s": lasting([9.5, 9.5, 9.5, 1])}, "f", "s")
 
 
 def test_indices_are_spread_and_unique() -> None:

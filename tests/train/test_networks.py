@@ -221,7 +221,8 @@ def test_options_are_typed_and_the_unknown_is_refused() -> None:
     for name, pairs in (("ours", ["colour=red"]), ("pcn", ["mirror=cue"]), ("ours", ["power=1"]), ("none", [])):
         with pytest.raises(ConfigError):
             parse_options(name, pairs)
-    for arguments in (("ours", "huge"), ("nothing",), ("ours", "tiny", "sight", {"mirror": "always"})):
+    wrong = [("ours", "huge"), ("nothing",), ("ours", "tiny", "sight", {"mirror": "always"})]
+    for arguments in (*wrong, *((name, "tiny", "box", {"trim": 5}) for name in ("ours", "queries"))):
         with pytest.raises(ConfigError):
             build(*arguments)  # type: ignore[arg-type]
     assert set(NETWORKS) == {"ours", "queries", "paper", "pcn", "adapointr"}

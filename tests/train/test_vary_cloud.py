@@ -14,15 +14,17 @@ from train.vary_cloud import borrowed, hidden, strays, stretch, window, with_str
 def test_a_window_is_frames_in_a_row(frames: int) -> None:
     rng = np.random.default_rng(0)
     numbers = np.arange(frames)
-    lengths = []
+    lengths, starts = [], []
     for _ in range(200):
         seen = np.flatnonzero(window(numbers, frames, rng))
         assert seen[-1] - seen[0] == len(seen) - 1
         lengths.append(len(seen))
+        starts.append(seen[0])
     assert min(lengths) >= min(frames, vary_cloud.LEAST_FRAMES)
     assert max(lengths) <= frames
     if frames == 400:  # log-uniform from 12 to 400: the median is their geometric mean
         assert 50 < np.median(lengths) < 96
+        assert 90 <= starts.count(0) <= 130, "half of them from the beginning, and few others by chance"
 
 
 def test_what_is_hidden_is_a_ball_about_a_point() -> None:

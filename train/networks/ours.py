@@ -80,6 +80,7 @@ class OurNetwork(CompletionNetwork):
         extra = int(options.power) + int(options.ground)
         super().__init__(width, classes, frame, coarse_points=options.coarse, extra=extra)
         require(not options.ground or frame == "sight", "option ground", frame, "frame sight: only there z is a height")
+        require(not options.trim or frame == "sight", "option trim", frame, "frame sight: the box gives the centre")
         self.options = options
         self.columns = 4 if options.power else 3
         self.trim_percent = options.trim

@@ -160,6 +160,7 @@ class QueryNetwork(CompletionModel):
     ) -> None:
         super().__init__(frame, width.queries, FINE_POINTS // width.queries)
         options = options or QueryOptions()
+        require(not options.trim or frame == "sight", "option trim", frame, "frame sight: the box gives the centre")
         self.width, self.options, self.classes, self.trim_percent = width, options, classes, options.trim
         channels, wide = width.channels, width.feature
         self.near_point, self.near_center = nn.Linear(3, width.local[0]), nn.Linear(3, width.local[0], bias=False)
