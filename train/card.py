@@ -19,7 +19,7 @@ _FRAMES = {
 
 _POINTNET = "Cascaded PointNet encoder, coarse decoder, folding with local features (the paper's shape completion)."
 _KINDS = {
-    "ours": _POINTNET,
+    "narrow": _POINTNET,
     "paper": _POINTNET,
     "pcn": "PointNet encoder, coarse decoder, folding (Point Completion Network).",
     "queries": "Transformer over neighbourhoods of the input; its queries are points of the input, their mirror images "

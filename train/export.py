@@ -15,7 +15,7 @@ from train.export_parts import Parts
 from train.export_queries import QueryBuilder
 from train.graph import per_object
 from train.network import CompletionModel, CompletionNetwork
-from train.networks.ours import OurNetwork, OurOptions
+from train.networks.narrow import NarrowNetwork, NarrowOptions
 from train.networks.queries import QueryNetwork
 from train.quantize import with_saturation_probe
 
@@ -32,7 +32,7 @@ def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
     the encoder's last weight is a constant, and so is the patch term.
 
     Args:
-        network: ``paper``, ``pcn``, ``ours`` or ``queries`` of ``networks.registry``, with any options.
+        network: ``queries``, ``narrow``, ``paper`` or ``pcn`` of ``networks.registry``, with any options.
         classifier: whether the graph gives classes; the paper's network has its classifier in training only.
     Returns:
         Model with input ``points`` float32 [n, columns] metres, n >= 1 free, and outputs ``fine`` float32 [fine, 3] and
@@ -47,7 +47,7 @@ def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
         raise ModelError(
             "this network has no edge graph",
             value=type(network).__name__,
-            allowed="paper, pcn, ours, queries",
+            allowed="queries, narrow, paper, pcn",
             action="choose",
         )
     return _Builder(network).model(classifier and network.classes > 0)
@@ -62,13 +62,14 @@ def export(model: onnx.ModelProto, path: Path) -> None:
 
 
 class _Builder(Parts):
-    """The layers of one network; method by method what ``network`` and ``networks.ours`` compute."""
+    """The layers of one network; method by method what ``network`` and ``networks.narrow`` compute."""
 
     network: CompletionNetwork
 
     def __init__(self, network: CompletionNetwork) -> None:
         super().__init__(network)
-        self.options = network.options if isinstance(network, OurNetwork) else OurOptions(coarse=network.coarse_points)
+        plain = NarrowOptions(coarse=network.coarse_points)
+        self.options = network.options if isinstance(network, NarrowNetwork) else plain
         self.channels, self.width = network.width.local[1], network.width.fold
         self.count, self.cells = network.coarse_points, network.cells
 
@@ -98,7 +99,7 @@ class _Builder(Parts):
 
     def _inputs(self) -> str:
         """Coordinates and what the options add, scaled in the first layer's weight."""
-        from train.networks.ours import GROUND_M, GROUND_WIDTH_M
+        from train.networks.narrow import GROUND_M, GROUND_WIDTH_M
 
         graph, columns = self.graph, ["centered"]
         if self.options.power:
@@ -112,7 +113,7 @@ class _Builder(Parts):
 
     def _encoder(self, source: str) -> tuple[str, str]:
         """Hidden rows of the second PointNet layer [n, channels] and the global feature [1, channels]."""
-        from train.networks.ours import POWER_DB
+        from train.networks.narrow import POWER_DB
 
         graph, weights = self.graph, self.weights
         lift = weights["point1.weight"] / np.array([self.scale] * 3 + [1.0] * (weights["point1.weight"].shape[1] - 3))
@@ -186,7 +187,7 @@ class _Builder(Parts):
         return last
 
     def _probe(self, hidden: str, feature: str) -> str:
-        """``OurNetwork._probe``: addition to the global feature [1, channels]."""
+        """``NarrowNetwork._probe``: addition to the global feature [1, channels]."""
         graph, weights = self.graph, self.weights
         anchors = self.network.anchors.numpy()  # type: ignore[operator]
         graph.add("Sub", ["low", "center"], "low_centered")
@@ -207,8 +208,8 @@ class _Builder(Parts):
         return self._layer("token_out", "tokens_high")
 
     def _look(self, coarse: str, own: str) -> str:
-        """``OurNetwork._look``: context of every coarse point [coarse, fold]."""
-        from train.networks.ours import LANDMARKS
+        """``NarrowNetwork._look``: context of every coarse point [coarse, fold]."""
+        from train.networks.narrow import LANDMARKS
 
         graph = self.graph
         weight, bias = self.weights["coarse_in.weight"] / self.scale, self.weights["coarse_in.bias"]
@@ -230,7 +231,7 @@ class _Builder(Parts):
         return graph.add("Add", [attended, self._layer(f"{name}.mlp.2", curved)], f"{name}.out")
 
     def _cue(self, coarse: str, hidden: str, rows: str, feature: str) -> list[str]:
-        """``OurNetwork._cue``: two terms of the folding's first layer."""
+        """``NarrowNetwork._cue``: two terms of the folding's first layer."""
         graph = self.graph
         self._plane(feature)
         other = graph.nearest_rows(self._mirrored(coarse, "image"), self.count, "mirror_rows")

@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     if not checkpoint.step:
         raise ModelError(f"{options.source}: not trained yet", action="train first")
     network = of_checkpoint(checkpoint)
-    model = build(network, classifier=checkpoint.settings.get("network", "ours") != "paper")
+    model = build(network, classifier=checkpoint.settings.get("network", "narrow") != "paper")
     inputs = calibration_inputs(network, _sets(options, network, "val"))
     target.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as name:
@@ -149,7 +149,7 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
         "samples_before": settings.get("samples_before", 0),
         "seconds": round(checkpoint.elapsed_s),
         "seed": settings["seed"],
-        "network": settings.get("network", "ours"),
+        "network": settings.get("network", "narrow"),
         "width": settings["width"],
         "frame": network.frame,
         "parameters": network.parameter_count,
@@ -179,7 +179,7 @@ def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str
     sets += f" --confidence {options.confidence.name}" if options.confidence else ""
     given: Callable[[str], str] = lambda name: f"--{name.replace('_', '-')} {getattr(options, name)}"  # noqa: E731
     return {
-        "fit": f"rfconstruct-train fit runs/{source} --network {settings.get('network', 'ours')} "
+        "fit": f"rfconstruct-train fit runs/{source} --network {settings.get('network', 'narrow')} "
         f"--width {settings['width']} --minutes {settings['budget_s'] / 60:g} --batch {settings['batch']} "
         f"--rate {settings['rate']:g} --seed {settings['seed']}{more}",
         "export": f"rfconstruct-train export runs/{source}/checkpoint.pt models/{target} "

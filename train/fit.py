@@ -108,7 +108,7 @@ class Trainer:
             kind = "a model's graph"
         else:
             earlier = load_checkpoint(path)
-            weights, kind = earlier.average, earlier.settings.get("network", "ours")
+            weights, kind = earlier.average, earlier.settings.get("network", "narrow")
             samples = earlier.samples + int(earlier.settings.get("samples_before", 0))
             trim = int(earlier.settings.get("options", {}).get("trim", 0))  # no weight tells
         refusal = ModelError(

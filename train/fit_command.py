@@ -59,8 +59,8 @@ def add_verb(verbs: Any) -> None:
 
 def _add_what(fit: argparse.ArgumentParser) -> None:
     """Which network and which data."""
-    fit.add_argument("--network", default="ours", help="ours, queries, paper, pcn or adapointr")
-    widths = "edge, paper, wide, tiny; queries: edge, tiny; adapointr: full, small, tiny"
+    fit.add_argument("--network", default="queries", help="queries, narrow, paper, pcn or adapointr")
+    widths = "queries: edge, tiny; narrow, paper, pcn: edge, paper, wide, tiny; adapointr: full, small, tiny"
     fit.add_argument("--width", default="", help=widths)
     fit.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="of the network; repeatable")
     fit.add_argument("--frame", choices=("sight", "box"), default="sight", help="line of sight in metres, or box prior")

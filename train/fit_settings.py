@@ -64,7 +64,7 @@ class FitSettings:
         ConfigError: a number outside its range.
     """
 
-    network: str = "ours"
+    network: str = "queries"
     width: str = "edge"
     options: dict[str, Option] = field(default_factory=dict)
     frame: Frame = "sight"

@@ -19,7 +19,7 @@ from onnx import numpy_helper
 
 from edge.errors import ModelError
 from train.network import CompletionModel, CompletionNetwork
-from train.networks.ours import OurNetwork
+from train.networks.narrow import NarrowNetwork
 from train.networks.queries import QueryNetwork
 
 PLAIN = ("point2", "coarse1", "coarse2", "fold2", "class1", "class2")
@@ -84,7 +84,7 @@ class _Reader:
         if not isinstance(network, CompletionNetwork):
             raise KeyError(type(network).__name__)
         self.arrays, self.network, self.scale = arrays, network, np.float32(network.scale)
-        if isinstance(network, OurNetwork):
+        if isinstance(network, NarrowNetwork):
             options = network.options
             if options.attention != "none" or options.power or options.ground:
                 raise KeyError("attention, power, ground")
@@ -124,7 +124,7 @@ class _Reader:
         return {"fold1.weight": np.concatenate(parts, axis=1).astype(np.float32), "fold1.bias": bias}
 
     def _added(self) -> Arrays:
-        """Of the options of ``ours``, where both the graph and the network have them."""
+        """Of the options of ``narrow``, where both the graph and the network have them."""
         result: Arrays = {}
         if "plane.weight" in self.arrays and hasattr(self.network, "plane"):
             unit = np.array([1, 1, 1 / self.scale], np.float32)

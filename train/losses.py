@@ -18,8 +18,8 @@ from train.auction import assign
 from train.auction_batched import assign_batched
 from train.nearest import nearest_index
 from train.network import SCALE_M, Completion, CompletionModel
+from train.networks.narrow import mirrored
 from train.networks.neighbours import neighbours, take
-from train.networks.ours import mirrored
 from train.objects.mesh import CLASSES
 
 RAMP = ((0.0, 0.1), (0.1, 0.5), (0.3, 1.0))

@@ -72,12 +72,12 @@ NETWORKS: list[tuple[str, Frame, dict[str, Option]]] = [
     ("paper", "sight", {}),
     ("paper", "box", {}),
     ("pcn", "box", {}),
-    ("ours", "sight", {"mirror": "cue"}),
-    ("ours", "sight", {"attention": "tokens"}),
-    ("ours", "sight", {"attention": "coarse", "uncertainty": True}),
-    ("ours", "sight", EVERYTHING),
-    ("ours", "sight", {"mirror": "cue", "trim": 5}),
-    ("ours", "sight", EVERYTHING | {"trim": 20}),
+    ("narrow", "sight", {"mirror": "cue"}),
+    ("narrow", "sight", {"attention": "tokens"}),
+    ("narrow", "sight", {"attention": "coarse", "uncertainty": True}),
+    ("narrow", "sight", EVERYTHING),
+    ("narrow", "sight", {"mirror": "cue", "trim": 5}),
+    ("narrow", "sight", EVERYTHING | {"trim": 20}),
     ("queries", "sight", {"trim": 5}),
     ("queries", "box", {"mirror": False}),
 ]
@@ -146,11 +146,12 @@ def test_golden_answers_are_repeated(folder: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(probability, golden[f"{name}:class_probability"], atol=1e-3)
 
 
-@pytest.fixture
-def checkpoint(network: CompletionNetwork, tmp_path: Path) -> Path:
-    state = network.state_dict()
+@pytest.fixture(params=["narrow", "queries"])
+def checkpoint(request: pytest.FixtureRequest, network: CompletionNetwork, tmp_path: Path) -> Path:
+    name = request.param
+    state = (network if name == "narrow" else registry.build(name)).state_dict()
     path = tmp_path / "runs" / "short" / "checkpoint.pt"
-    save_checkpoint(path, Checkpoint(state, state, {}, 5, 80, 12.0, asdict(FitSettings()), []))
+    save_checkpoint(path, Checkpoint(state, state, {}, 5, 80, 12.0, asdict(FitSettings(network=name)), []))
     return path
 
 

@@ -28,6 +28,7 @@ from train.perturb_settings import PerturbSettings
 
 DATA = DatasetSettings(truth_points=512, max_points=200, epoch_samples=24, parametric_objects=1, evaluation_views=1)
 SETTINGS = FitSettings(
+    network="narrow",
     width="tiny",
     steps=6,
     batch=4,
@@ -225,7 +226,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_stopped(
         assert torch.equal(value, leg.average[name]), name
 
 
-@pytest.mark.parametrize(("network", "precision"), [("pcn", "fp32"), ("adapointr", "fp32"), ("ours", "bf16")])
+@pytest.mark.parametrize(("network", "precision"), [("pcn", "fp32"), ("adapointr", "fp32"), ("narrow", "bf16")])
 def test_every_network_trains_and_continues_exactly(
     network: str, precision: str, data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
 ) -> None:

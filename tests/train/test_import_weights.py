@@ -32,10 +32,10 @@ def made(kind: str, frame: Frame, options: dict[str, Option], seed: int = 0) -> 
 @pytest.mark.parametrize(
     ("kind", "frame", "options"),
     [
-        ("ours", "sight", {}),
-        ("ours", "sight", {"mirror": "cue", "uncertainty": True}),
-        ("ours", "sight", {"mirror": "cue", "trim": 5}),
-        ("ours", "box", {"mirror": "cue", "coarse": 512}),
+        ("narrow", "sight", {}),
+        ("narrow", "sight", {"mirror": "cue", "uncertainty": True}),
+        ("narrow", "sight", {"mirror": "cue", "trim": 5}),
+        ("narrow", "box", {"mirror": "cue", "coarse": 512}),
         ("queries", "sight", {"trim": 5}),
         ("queries", "box", {"mirror": False}),
         ("pcn", "sight", {}),
@@ -61,7 +61,7 @@ def test_a_network_comes_back(kind: str, frame: Frame, options: dict[str, Option
 
 
 def test_options_may_be_added_and_samples_are_counted(tmp_path: Path) -> None:
-    network, other = made("ours", "sight", {}), made("ours", "sight", {"mirror": "cue"}, seed=1)
+    network, other = made("narrow", "sight", {}), made("narrow", "sight", {"mirror": "cue"}, seed=1)
     export(build(network), tmp_path / FULL)
     (tmp_path / "manifest.json").write_text('{"training": {"samples": 3, "samples_before": 4}}')
     assert Trainer._load_start(other, tmp_path) == 7
@@ -71,10 +71,10 @@ def test_options_may_be_added_and_samples_are_counted(tmp_path: Path) -> None:
 
 
 def test_another_centre_is_refused_unless_there_was_none(tmp_path: Path) -> None:
-    plain, trimmed = made("ours", "sight", {}), made("ours", "sight", {"trim": 5})
+    plain, trimmed = made("narrow", "sight", {}), made("narrow", "sight", {"trim": 5})
     export(build(trimmed), tmp_path / FULL)
     assert read_weights(tmp_path, trimmed)[1] == 0
-    for other in (plain, made("ours", "sight", {"trim": 4})):
+    for other in (plain, made("narrow", "sight", {"trim": 4})):
         with pytest.raises(ModelError, match="trim=5"):
             read_weights(tmp_path, other)
     export(build(plain), tmp_path / FULL)
@@ -82,7 +82,7 @@ def test_another_centre_is_refused_unless_there_was_none(tmp_path: Path) -> None
 
 
 def test_what_is_no_such_graph_is_refused(tmp_path: Path) -> None:
-    network = made("ours", "sight", {})
+    network = made("narrow", "sight", {})
     with pytest.raises(ModelError, match="no fp32 graph"):
         read_weights(tmp_path, network)
     (tmp_path / FULL).write_bytes(b"\x08\x07nothing")
@@ -94,12 +94,12 @@ def test_what_is_no_such_graph_is_refused(tmp_path: Path) -> None:
     export(build(network), tmp_path / FULL)
     torch.manual_seed(0)
     with pytest.raises(ModelError, match="same network and width"):
-        read_weights(tmp_path, registry.build("ours", "tiny", "sight", {}))
+        read_weights(tmp_path, registry.build("narrow", "tiny", "sight", {}))
     with pytest.raises(ModelError, match="attention"):
-        read_weights(tmp_path, registry.build("ours", "edge", "sight", {"attention": "tokens"}))
+        read_weights(tmp_path, registry.build("narrow", "edge", "sight", {"attention": "tokens"}))
 
 
 def test_every_class_of_the_project_has_a_row(tmp_path: Path) -> None:
-    network = made("ours", "sight", {})
+    network = made("narrow", "sight", {})
     export(build(network), tmp_path / FULL)
     assert read_weights(tmp_path, network)[0]["class2.bias"].shape == (len(CLASSES),)

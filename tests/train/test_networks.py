@@ -13,15 +13,15 @@ from torch.utils.flop_counter import FlopCounterMode
 from edge.errors import ConfigError
 from train.losses import LossSettings, Matcher, completion_loss
 from train.network import FINE_POINTS, SCALE_M, WIDTHS, CompletionModel, CompletionNetwork, middle
+from train.networks.narrow import NarrowNetwork, NarrowOptions, mirrored
 from train.networks.neighbours import farthest, fixed, neighbours, take
-from train.networks.ours import OurNetwork, OurOptions, mirrored
 from train.networks.registry import NETWORKS, build, parse_options
 
 EVERYTHING = {
     "mirror": "cue", "attention": "both", "uncertainty": True, "coarse": 512, "power": True, "ground": True,
 }  # fmt: skip
-CASES = [("paper", {}), ("pcn", {}), ("ours", {}), ("ours", EVERYTHING), ("adapointr", {})]
-CENTERED = [*CASES, ("ours", {"trim": 5})]
+CASES = [("paper", {}), ("pcn", {}), ("narrow", {}), ("narrow", EVERYTHING), ("adapointr", {})]
+CENTERED = [*CASES, ("narrow", {"trim": 5})]
 QUERIES = [("queries", {}), ("queries", {"mirror": False, "denoise": False})]
 
 
@@ -71,7 +71,7 @@ def test_sizes_gradients_and_order(name: str, options: dict[str, object]) -> Non
     output = network(points, counts, torch.arange(network.cells // 4))
     assert output.coarse.shape == (3, network.coarse_points, 3)
     assert output.fine.shape == (3, FINE_POINTS // 4, 3)
-    assert output.logits.shape == (3, 4 if name in ("paper", "ours", "queries") else 0)
+    assert output.logits.shape == (3, 4 if name in ("paper", "narrow", "queries") else 0)
     settings = LossSettings(emd_points=128)
     generator = torch.Generator().manual_seed(0)
     labels = torch.tensor([0, 1, 3])
@@ -102,22 +102,24 @@ def test_order_and_repetition_of_points_do_not_matter(name: str, options: dict[s
             torch.testing.assert_close(output.coarse, reference.coarse, atol=1e-7, rtol=0)
 
 
-def test_with_all_switches_off_ours_is_the_papers_and_attention_starts_at_no_move() -> None:
+def test_with_all_switches_off_narrow_is_the_papers_and_attention_starts_at_no_move() -> None:
     plain, points = CompletionNetwork(WIDTHS["tiny"], 4), cloud(150, 3)
     with torch.no_grad():
         reference = plain(points, [150])
-        for options in (OurOptions(), OurOptions(attention="tokens"), OurOptions(mirror="plane", uncertainty=True)):
-            ours = OurNetwork(WIDTHS["tiny"], 4, "sight", options)
-            ours.load_state_dict(plain.state_dict(), strict=False)
-            torch.testing.assert_close(ours(points, [150]).fine, reference.fine, atol=1e-6, rtol=0)
-        ours = OurNetwork(WIDTHS["tiny"], 4, "sight", OurOptions(attention="coarse"))
-        ours.load_state_dict(plain.state_dict(), strict=False)
-        torch.testing.assert_close(ours(points, [150]).coarse, reference.coarse, atol=1e-6, rtol=0)
+        switched = (NarrowOptions(attention="tokens"), NarrowOptions(mirror="plane", uncertainty=True))
+        for options in (NarrowOptions(), *switched):
+            narrow = NarrowNetwork(WIDTHS["tiny"], 4, "sight", options)
+            narrow.load_state_dict(plain.state_dict(), strict=False)
+            torch.testing.assert_close(narrow(points, [150]).fine, reference.fine, atol=1e-6, rtol=0)
+        narrow = NarrowNetwork(WIDTHS["tiny"], 4, "sight", NarrowOptions(attention="coarse"))
+        narrow.load_state_dict(plain.state_dict(), strict=False)
+        torch.testing.assert_close(narrow(points, [150]).coarse, reference.coarse, atol=1e-6, rtol=0)
 
 
 def test_options_that_are_added_to_trained_weights_begin_at_no_effect() -> None:
     plain, points = CompletionNetwork(WIDTHS["tiny"], 4), cloud(150, 3)
-    richer = OurNetwork(WIDTHS["tiny"], 4, "sight", OurOptions(mirror="cue", attention="tokens", uncertainty=True))
+    options = NarrowOptions(mirror="cue", attention="tokens", uncertainty=True)
+    richer = NarrowNetwork(WIDTHS["tiny"], 4, "sight", options)
     missing = richer.load_state_dict(plain.state_dict(), strict=False).missing_keys
     assert richer.begin_without(missing)
     with torch.no_grad():
@@ -141,7 +143,7 @@ def test_with_trim_a_few_points_far_away_do_not_move_the_centre() -> None:
     inside = torch.rand(950, 3, generator=torch.Generator().manual_seed(4))
     strays = torch.tensor([3.0, 5.0, 0.0]).expand(40, 3)
     for trim, least_m, most_m in ((0, 1.0, 3.0), (5, 0.0, 0.04)):
-        network = OurNetwork(WIDTHS["tiny"], 4, "sight", OurOptions(trim=trim)).eval()
+        network = NarrowNetwork(WIDTHS["tiny"], 4, "sight", NarrowOptions(trim=trim)).eval()
         with torch.no_grad():
             clean, soiled = (network(p, [len(p)]).center for p in (inside, torch.cat([inside, strays])))
         assert clean is not None
@@ -172,7 +174,7 @@ def test_box_frame_is_neither_centred_nor_scaled() -> None:
         moved = box(points + 0.1, [122]).fine - box(points, [122]).fine
     assert (moved - 0.1).abs().max() > 1e-3
     with pytest.raises(ConfigError, match="ground"):
-        build("ours", "tiny", "box", {"ground": True})
+        build("narrow", "tiny", "box", {"ground": True})
 
 
 @pytest.mark.parametrize("name", ["adapointr", "queries"])
@@ -187,7 +189,7 @@ def test_noisy_queries_do_not_change_the_true_ones(name: str) -> None:
 
 def test_rounded_inner_layers_move_points_by_little() -> None:
     """bfloat16 keeps 8 bits: 0.4 % of what a layer computes; coordinates themselves are never rounded (5 m: 2 cm)."""
-    network, points = network_of("ours", {}).eval(), cloud(200, 3)
+    network, points = network_of("narrow", {}).eval(), cloud(200, 3)
     with torch.no_grad():
         exact = network(points, [200])
         with torch.autocast("cpu", torch.bfloat16):
@@ -216,13 +218,13 @@ def test_point_set_operations_equal_brute_force() -> None:
 
 
 def test_options_are_typed_and_the_unknown_is_refused() -> None:
-    parsed = parse_options("ours", ["mirror=cue", "coarse=512", "power=true"])
+    parsed = parse_options("narrow", ["mirror=cue", "coarse=512", "power=true"])
     assert parsed == {"mirror": "cue", "coarse": 512, "power": True}
-    for name, pairs in (("ours", ["colour=red"]), ("pcn", ["mirror=cue"]), ("ours", ["power=1"]), ("none", [])):
+    for name, pairs in (("narrow", ["colour=red"]), ("pcn", ["mirror=cue"]), ("narrow", ["power=1"]), ("none", [])):
         with pytest.raises(ConfigError):
             parse_options(name, pairs)
-    wrong = [("ours", "huge"), ("nothing",), ("ours", "tiny", "sight", {"mirror": "always"})]
-    for arguments in (*wrong, *((name, "tiny", "box", {"trim": 5}) for name in ("ours", "queries"))):
+    wrong = [("narrow", "huge"), ("nothing",), ("narrow", "tiny", "sight", {"mirror": "always"})]
+    for arguments in (*wrong, *((name, "tiny", "box", {"trim": 5}) for name in ("narrow", "queries"))):
         with pytest.raises(ConfigError):
             build(*arguments)  # type: ignore[arg-type]
-    assert set(NETWORKS) == {"ours", "queries", "paper", "pcn", "adapointr"}
+    assert set(NETWORKS) == {"narrow", "queries", "paper", "pcn", "adapointr"}

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from train.networks.narrow import mirrored
 from train.networks.neighbours import farthest, take
-from train.networks.ours import mirrored
 from train.networks.queries import QUERY_WIDTHS, QueryNetwork, QueryOptions
 from train.networks.sampling import order, shuffled, spread
 

@@ -20,8 +20,8 @@ from edge.config import require
 from edge.frames import Float32
 from train.network import FINE_POINTS, Completion, CompletionModel, Frame, exactly
 from train.networks.attention import Attention, perceptron
+from train.networks.narrow import mirrored
 from train.networks.neighbours import neighbours, take
-from train.networks.ours import mirrored
 from train.networks.sampling import shuffled, spread
 
 DENOISED, JITTER = 64, 0.02

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks by name: ``paper``, ``pcn``, ``adapointr`` and ``ours``, with their widths and options."""
+"""Networks by name: ``queries``, ``narrow``, ``paper``, ``pcn`` and ``adapointr``, with their widths and options."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from edge.config import require
 from train.network import WIDTHS, CompletionModel, CompletionNetwork, Frame
 from train.networks.adapointr import TRANSFORMER_WIDTHS, AdaPoinTr
-from train.networks.ours import OurNetwork, OurOptions
+from train.networks.narrow import NarrowNetwork, NarrowOptions
 from train.networks.queries import QUERY_WIDTHS, QueryNetwork, QueryOptions
 from train.objects.mesh import CLASSES
 
@@ -37,11 +37,11 @@ class Entry:
     about: str
 
 
-_OPTIONS: dict[str, type] = {field.name: type(field.default) for field in fields(OurOptions)}
+_OPTIONS: dict[str, type] = {field.name: type(field.default) for field in fields(NarrowOptions)}
 _QUERY_OPTIONS: dict[str, type] = {field.name: type(field.default) for field in fields(QueryOptions)}
 NETWORKS = {
     "queries": Entry(tuple(QUERY_WIDTHS), "edge", _QUERY_OPTIONS, "transformer for the edge, queries from the input"),
-    "ours": Entry(tuple(WIDTHS), "edge", _OPTIONS, "narrow, line of sight, with the switches of --option"),
+    "narrow": Entry(tuple(WIDTHS), "edge", _OPTIONS, "the paper's, narrow, with the switches of --option"),
     "paper": Entry(tuple(WIDTHS), "paper", {}, "the paper's: local features, folding, classifier in training"),
     "pcn": Entry(tuple(WIDTHS), "paper", {}, "Point Completion Network: no local features, no classifier"),
     "adapointr": Entry(tuple(TRANSFORMER_WIDTHS), "full", {}, "transformer in the manner of AdaPoinTr"),
@@ -94,8 +94,8 @@ def build(
     values: dict[str, Any] = chosen
     if name == "queries":
         return QueryNetwork(QUERY_WIDTHS[width], len(CLASSES), frame, QueryOptions(**values))
-    if name == "ours":
-        return OurNetwork(WIDTHS[width], len(CLASSES), frame, OurOptions(**values))
+    if name == "narrow":
+        return NarrowNetwork(WIDTHS[width], len(CLASSES), frame, NarrowOptions(**values))
     return CompletionNetwork(WIDTHS[width], len(CLASSES) if name == "paper" else 0, frame, local=name == "paper")
 
 
@@ -103,7 +103,7 @@ def of_checkpoint(checkpoint: Checkpoint) -> CompletionModel:
     """The trained network of a run, its averaged weights, ready to use on the CPU."""
     settings = checkpoint.settings
     network = build(
-        settings.get("network", "ours"), settings["width"], settings.get("frame", "sight"), settings.get("options")
+        settings.get("network", "narrow"), settings["width"], settings.get("frame", "sight"), settings.get("options")
     )
     network.load_state_dict(checkpoint.average)
     return network.eval()

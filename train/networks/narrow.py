@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our network: the paper's, narrow, in the line-of-sight frame, with switches for what may make it better.
+"""The paper's network, narrow, in the line-of-sight frame, with switches for what may make it better.
 
 Every switch is off by default; with all off it is ``CompletionNetwork`` of the same width. None needs farthest-point
 sampling or a loop over the data, and order and repetition of the input points never matter (with ``trim``, which counts
@@ -35,7 +35,7 @@ POWER_DB = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class OurOptions:
+class NarrowOptions:
     """Switches.
 
     Args:
@@ -65,7 +65,7 @@ class OurOptions:
         require(0 <= self.trim < 50, "option trim", self.trim, "0..49 percent")
 
 
-class OurNetwork(CompletionNetwork):
+class NarrowNetwork(CompletionNetwork):
     """See the module.
 
     Args:
@@ -75,8 +75,10 @@ class OurNetwork(CompletionNetwork):
 
     anchors: Tensor
 
-    def __init__(self, width: Width, classes: int, frame: Frame = "sight", options: OurOptions | None = None) -> None:
-        options = options or OurOptions()
+    def __init__(
+        self, width: Width, classes: int, frame: Frame = "sight", options: NarrowOptions | None = None
+    ) -> None:
+        options = options or NarrowOptions()
         extra = int(options.power) + int(options.ground)
         super().__init__(width, classes, frame, coarse_points=options.coarse, extra=extra)
         require(not options.ground or frame == "sight", "option ground", frame, "frame sight: only there z is a height")
