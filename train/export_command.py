@@ -172,6 +172,10 @@ def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str
     more += "" if settings.get("precision", "fp32") == "fp32" else f" --precision {settings['precision']}"
     root = "runs" if Path(start).suffix == ".pt" else "models"  # of a checkpoint, or of a shipped model
     names = (Path(start).parent.name, Path(start).name) if root == "runs" else (Path(start).name,)
+    loss = settings.get("loss", {})
+    for name, usual in (("fine_emd", 0.0), ("beta", 0.02)):
+        if loss.get(name, usual) != usual:
+            more += f" --{name.replace('_', '-')} {loss[name]:g}"
     more += f" --start {'/'.join((root, *names))}" if start else ""
     if "simulated_share" in data:
         more += f" --simulated DRIVE_BYS --simulated-share {data['simulated_share']:g}"

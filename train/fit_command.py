@@ -43,6 +43,7 @@ def add_verb(verbs: Any) -> None:
     fit.add_argument("--average", type=float, default=0.999, help="decay of the averaged weights")
     fit.add_argument("--emd-points", type=int, default=512, help="points that are matched")
     fit.add_argument("--fine-emd", type=float, default=0.0, metavar="W", help="weight of it for adapointr and queries")
+    fit.add_argument("--beta", type=float, default=0.02, help="weight of the cross entropy of the classes")
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     fit.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of the inner layers")
@@ -84,6 +85,7 @@ def _fit(options: argparse.Namespace) -> int:
         squared=options.squared,
         emd_points=options.emd_points,
         fine_emd=options.fine_emd,
+        beta=options.beta,
         joint=options.joint_uncertainty,
         class_weights=_class_weights(options.class_weight),
     )
