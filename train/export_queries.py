@@ -67,12 +67,12 @@ class QueryBuilder(Parts):
             source = self._layer(f"{name}.{number}", source)
         return source
 
-    def _topk(self, source: str, count: int, output: str, largest: int) -> str:
-        """Places of the largest or smallest numbers of every row: int64, the first of them first."""
+    def _topk(self, source: str, count: int, output: str, largest: int, values: bool = False) -> str:
+        """Places, or with ``values`` the numbers themselves, of the largest or smallest of every row, in order."""
         k, outputs = self.graph.integers(count), [f"{output}_values", output]
         node = helper.make_node("TopK", [source, k], outputs, name=output, axis=-1, largest=largest)
         self.graph.nodes.append(node)
-        return output
+        return outputs[0] if values else output
 
     def _cloud(self) -> None:
         """``sampling.shuffled`` in network units: "drawn" [points, 3], "drawn_first" bool [points]."""
@@ -100,7 +100,7 @@ class QueryBuilder(Parts):
         return self.graph.add("Gemm", [queries, points, norms], output, alpha=-2.0, transB=1)
 
     def _spread(self) -> None:
-        """``sampling.spread``: "places" [proxies, 3], and "drawn_norm_first" with repetitions far away."""
+        """``sampling.spread``: "places" [proxies, 3], whether they repeat none, and "drawn_norm_first"."""
         graph, size = self.graph, self.width.points
         steps = np.arange(size, dtype=np.int64)
         column, row = graph.constant("steps_column", steps[:, None]), graph.constant("steps_row", steps[None])
@@ -120,8 +120,10 @@ class QueryBuilder(Parts):
         square = graph.add("Add", [nearest, graph.view(norms, (size,), "drawn_norms_flat")], "drawn_radius")
         last = graph.constant("last", -(steps + 1).astype(np.float32))
         rank = graph.add("Where", ["drawn_first", square, last], "drawn_rank")
-        rows = self._topk(rank, self.width.proxies, "proxies", 1)
+        count = self.width.proxies
+        rows = self._topk(self._topk(rank, count, "proxies", 1), count, "proxies_rising", 0, values=True)
         graph.add("Gather", ["drawn", rows], "places", axis=0)
+        graph.add("Gather", ["drawn_first", rows], "places_new", axis=0)
 
     def _near(self, queries: str, points: str, norms: str, count: int, output: str) -> str:
         """Rows of the nearest points: int64 [q, count]."""
@@ -176,24 +178,29 @@ class QueryBuilder(Parts):
         return self.graph.add("Gelu", [hidden], f"{name}_hidden")
 
     def _queries(self, feature: str) -> None:
-        """Chosen candidates "asked" [queries, 6], of it "asked_places" [queries, 3], and "asked_score" [queries, 1]."""
-        graph, proxies = self.graph, self.width.proxies
-        predicted = graph.view(self._perceptron("coarse", feature), (self.count, _KIND), "predicted")
-        parts, counts = [predicted, "places"], [self.count, proxies]
+        """Queries "asked" [queries, 6], of these "asked_places" [queries, 3], and "asked_score" [queries, 1]."""
+        graph, proxies, made = self.graph, self.width.proxies, self.network.predicted
+        predicted = graph.view(self._perceptron("coarse", feature), (made, _KIND), "predicted")
+        parts, new = ["places"], ["places_new"]
         if self.network.options.mirror:
             self._plane(feature)
-            parts, counts = [*parts, self._mirrored("places", "image")], [*counts, proxies]
-        kinds = np.repeat(np.eye(3, dtype=np.float32)[: len(counts)], counts, axis=0)
+            parts, new = [*parts, self._mirrored("places", "image")], [*new, "places_new"]
+        kinds = np.eye(3, dtype=np.float32)
+        own, seen = np.repeat(kinds[:1], made, axis=0), np.repeat(kinds[1 : 1 + len(parts)], proxies, axis=0)
+        graph.add("Concat", [predicted, graph.constant("kind_predicted", own)], "asked_predicted", axis=1)
         every = graph.add("Concat", parts, "candidate_places", axis=0)
-        graph.add("Concat", [every, graph.constant("kinds", kinds)], "candidates", axis=1)
+        graph.add("Concat", [every, graph.constant("kinds", seen)], "candidates", axis=1)
         hidden = self._of_kinds("score", "candidates", feature)
         score = graph.add("Sigmoid", [self._perceptron("score", hidden)], "scores")
-        best = self._topk(graph.view(score, (-1,), "scores_flat"), self.count, "best", 1)
-        node = helper.make_node("TopK", [best, graph.integers(self.count)], ["chosen", "chosen_order"], name="chosen",
-                                axis=0, largest=0)  # fmt: skip
-        graph.nodes.append(node)
-        graph.add("Gather", ["candidates", "chosen"], "asked", axis=0)
-        graph.add("Gather", [score, "chosen"], "asked_score", axis=0)
+        last = graph.constant("candidate_last", -np.arange(1, len(seen) + 1, dtype=np.float32))
+        known = graph.add("Concat", new, "candidate_new", axis=0)
+        rank = graph.add("Where", [known, graph.view(score, (-1,), "scores_flat"), last], "candidate_rank")
+        best = self._topk(rank, self.count - made, "best", 1)
+        chosen = self._topk(best, self.count - made, "chosen", 0, values=True)
+        found = graph.add("Gather", ["candidates", chosen], "asked_seen", axis=0)
+        graph.add("Concat", ["asked_predicted", found], "asked", axis=0)
+        given = graph.constant("score_predicted", np.ones((made, 1), np.float32))
+        graph.add("Concat", [given, graph.add("Gather", [score, chosen], "score_seen", axis=0)], "asked_score", axis=0)
         graph.add("Slice", ["asked", *(graph.integers(n) for n in (0, _KIND, 1))], "asked_places")
 
     def _decode(self, memory: str) -> str:

@@ -42,7 +42,7 @@ def add_verb(verbs: Any) -> None:
     fit.add_argument("--cells", type=int, default=4, help="of 16 shares of the fine cloud, how many in a step")
     fit.add_argument("--average", type=float, default=0.999, help="decay of the averaged weights")
     fit.add_argument("--emd-points", type=int, default=512, help="points that are matched")
-    fit.add_argument("--fine-emd", type=float, default=0.0, metavar="W", help="weight of it for adapointr and queries")
+    fit.add_argument("--fine-emd", type=float, default=0.0, metavar="W", help="weight of the EMD of random fine points")
     fit.add_argument("--beta", type=float, default=0.02, help="weight of the cross entropy of the classes")
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
@@ -61,7 +61,7 @@ def add_verb(verbs: Any) -> None:
 def _add_what(fit: argparse.ArgumentParser) -> None:
     """Which network and which data."""
     fit.add_argument("--network", default="queries", help="queries, narrow, paper, pcn or adapointr")
-    widths = "queries: edge, tiny; narrow, paper, pcn: edge, paper, wide, tiny; adapointr: full, small, tiny"
+    widths = "queries: edge, wide, tiny; narrow, paper, pcn: edge, paper, wide, tiny; adapointr: full, small, tiny"
     fit.add_argument("--width", default="", help=widths)
     fit.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="of the network; repeatable")
     fit.add_argument("--frame", choices=("sight", "box"), default="sight", help="line of sight in metres, or box prior")

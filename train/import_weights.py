@@ -142,6 +142,8 @@ class _QueryReader:
 
     def __init__(self, arrays: Arrays, network: CompletionModel) -> None:
         self.arrays, self.network, self.scale = arrays, network, np.float32(network.scale)
+        if "plane.weight" in arrays and not hasattr(network, "plane"):
+            raise KeyError("mirror")
 
     def read(self) -> Arrays:
         """Everything; KeyError names a parameter that the graph lacks."""

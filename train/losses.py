@@ -38,7 +38,7 @@ class LossSettings:
             distances and the mean of both directions that its figures fit.
         emd_points: random points of both clouds that are matched.
         emd_tolerance: relative excess over the optimal matching that is accepted.
-        fine_emd: weight of the EMD of as many random fine points, for a network whose coarse cloud has none.
+        fine_emd: weight of the EMD of as many random fine points.
         beta: weight of the cross entropy.
         gamma: weight of the expected distance's log-likelihood, where the network gives one.
         joint: let that term move the points too (heteroscedastic Chamfer distance); else it only learns to expect.
@@ -174,7 +174,8 @@ class LossTerms:
         coarse: EMD, or Chamfer distance where the network asks for it.
         fine: Chamfer distance.
         label: cross entropy, 0 without a classifier.
-        extra: weighted sum of what only some networks have: expected distance, plane of symmetry, denoised patches.
+        extra: weighted sum of the EMD of fine points, and of what only some networks have: expected distance, plane of
+            symmetry, denoised patches.
     """
 
     total: Tensor
@@ -203,7 +204,7 @@ def completion_loss(
         progress: share of the training budget, 0..1.
         settings: which form and weights.
         matcher: finds neighbours and assignments.
-        generator: draws the coarse points that are matched.
+        generator: draws the points that are matched.
         network: whose scale and kind of loss; None: line of sight, EMD and ramp.
     """
     require(truth_m.shape[1] >= settings.emd_points, "truth points", truth_m.shape[1], ">= loss.emd_points")
@@ -212,8 +213,6 @@ def completion_loss(
     weights = settings.weights(labels)
     if network and network.coarse_loss == "chamfer":
         coarse_loss = _joined(*two_ways(coarse, truth, matcher, settings.squared), settings.squared)
-        if settings.fine_emd:
-            coarse_loss = coarse_loss + settings.fine_emd * _some_matched(fine, truth, settings, matcher, generator)
     else:
         coarse_loss = _some_matched(coarse, truth, settings, matcher, generator)
     forth, back = two_ways(fine, truth, matcher, settings.squared)
@@ -222,6 +221,8 @@ def completion_loss(
     if output.logits.shape[1]:
         label_loss = functional.cross_entropy(output.logits.float(), labels, reduction="none")
     extra = _extra(output, truth, forth, scale, settings, matcher)
+    if settings.fine_emd:
+        extra = extra + settings.fine_emd * _some_matched(fine, truth, settings, matcher, generator)
     rise = alpha(progress) if network is None or network.ramp else 1.0
     total = (weights * (coarse_loss + rise * fine_loss + settings.beta * label_loss + extra)).mean()
     return LossTerms(total, coarse_loss.mean(), fine_loss.mean(), label_loss.mean(), extra.mean())

@@ -51,7 +51,7 @@ def test_small_clouds_are_repeated_and_large_ones_thinned() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_spread_points_are_apart_and_cover_the_rest(seed: int) -> None:
     """Packing: any two are at least as far apart as the smallest of the distances by which they were chosen. Covering:
-    the farthest point from them is at most twice as far as with farthest-point sampling, which sees all of them."""
+    the largest hole is at most twice as large as with farthest-point sampling, the mean distance hardly larger."""
     cloud, first = shuffled(scan(700, seed), [700], 1024)
     rows = spread(cloud, first, 64)[0]
     chosen = cloud[0, rows]
@@ -61,35 +61,66 @@ def test_spread_points_are_apart_and_cover_the_rest(seed: int) -> None:
     distance = torch.cdist(own, own).masked_fill(torch.ones(700, 700).triu().bool(), torch.inf).amin(1)
     apart = torch.cdist(chosen, chosen).masked_fill(torch.eye(64).bool(), torch.inf).amin()
     assert apart >= distance.topk(64).values[-1] - 1e-3
-    covering = [float(torch.cdist(own, some).amin(1).max()) for some in (chosen, take(cloud, farthest(cloud, 64))[0])]
-    assert covering[0] <= 2 * covering[1]
+    ours, best = (torch.cdist(own, some).amin(1) for some in (chosen, take(cloud, farthest(cloud, 64))[0]))
+    assert ours.max() <= 2 * best.max()
+    assert ours.mean() <= 1.1 * best.mean()
 
 
 def test_repetitions_come_last_in_their_order() -> None:
     cloud, first = shuffled(scan(40), [40], 128)
     rows = spread(cloud, first, 60)[0]
-    assert bool(first[0, rows[:40]].all())
-    assert rows[40:].tolist() == torch.nonzero(~first[0])[:20, 0].tolist()
+    assert rows[first[0, rows]].tolist() == torch.nonzero(first[0])[:, 0].tolist()
+    assert rows[~first[0, rows]].tolist() == torch.nonzero(~first[0])[:20, 0].tolist()
 
 
 def test_queries_come_from_where_the_score_says() -> None:
-    """Scores of the kind alone: the best 64 are then all 32 proxies and their 32 mirror images."""
+    """Scores of the kind alone: after the 32 predicted queries come the 32 proxies, or their 32 mirror images."""
     network, points = network_of(), scan(200)
     with torch.no_grad():
         network.score_place.weight.zero_()
-        network.score_place.weight[0, 4:] = 9
         for layer in (network.score_feature, network.score[0], network.score[2]):
             layer.weight.zero_()  # type: ignore[union-attr, operator]
             layer.bias.zero_()  # type: ignore[union-attr, operator]
         network.score[0].weight[0, 0] = network.score[2].weight[0, 0] = 1  # type: ignore[union-attr, index, operator]
         network.plane.weight.normal_()
-        answer = network(points, [200])
-    assert answer.plane is not None
-    assert answer.center is not None
-    found = (answer.coarse - answer.center[:, None]) / network.scale
-    proxies, images = found[:, :32], found[:, 32:]
+        found = []
+        for kind in (4, 5):
+            network.score_place.weight[0] = 0
+            network.score_place.weight[0, kind] = 9
+            answer = network(points, [200])
+            assert answer.plane is not None
+            assert answer.center is not None
+            found.append((answer.coarse - answer.center[:, None]) / network.scale)
+    torch.testing.assert_close(found[0][:, :32], found[1][:, :32])
+    proxies, images = (one[:, 32:] for one in found)
     torch.testing.assert_close(images, mirrored(proxies, answer.plane), atol=1e-5, rtol=0)
     assert float(torch.cdist(proxies[0] * network.scale + answer.center, points).amin(1).max()) < 1e-4
+
+
+def test_few_points_are_queries_once_each() -> None:
+    """20 points are 20 proxies that differ and 12 that repeat: the 32 chosen queries all differ."""
+    network = network_of(trim=5)
+    with torch.no_grad():
+        network.plane.weight.normal_()
+        coarse = network(scan(20), [20]).coarse[0]
+    apart = torch.cdist(coarse, coarse, compute_mode="donot_use_mm_for_euclid_dist")
+    assert float(apart.masked_fill(torch.eye(64).bool(), torch.inf).amin()) > 1e-4
+
+
+def test_rounding_of_inner_layers_does_not_touch_the_sampling() -> None:
+    cloud, first = shuffled(scan(500), [500], 1024)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = spread(cloud, first, 64)
+    assert torch.equal(rounded, spread(cloud, first, 64))
+
+
+def test_a_nearly_equal_distance_moves_no_row() -> None:
+    """The 64th and the 65th may change places under a jitter of a micrometre, the others stand where they stood."""
+    cloud, first = shuffled(scan(600), [600], 1024)
+    jitter = 1e-6 * torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0))
+    before, after = spread(cloud, first, 64)[0].tolist(), spread(cloud + jitter, first, 64)[0].tolist()
+    assert len(set(before) ^ set(after)) <= 2
+    assert before == sorted(before)
 
 
 def test_a_shift_in_the_plane_shifts_the_answer_and_height_counts() -> None:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A transformer for the edge: its queries are points of the input, their mirror images and predicted points.
 
-After AdaPoinTr (Yu, Rao, Wang, Lu, Zhou, TPAMI 2023): proxies of local neighbourhoods, encoder, queries that a learned
-score chooses from candidates, decoder, patches rebuilt about the queries. Different: a sampling without a loop
-(``sampling.spread``), one grouping instead of four, candidates mirrored about the estimated plane of symmetry, a score
-that knows the whole cloud, classes, and an expected distance of every fine point.
+After AdaPoinTr (Yu, Rao, Wang, Lu, Zhou, TPAMI 2023): proxies of local neighbourhoods, encoder, queries of which some
+are predicted and some come from the input, decoder, patches rebuilt about the queries. Different: a sampling without a
+loop (``sampling.spread``), one grouping instead of four, half of the queries always predicted and the other half chosen
+among proxies and their images in the estimated plane of symmetry, by a learned score that knows the whole cloud;
+classes, and an expected distance of every fine point.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class QueryWidth:
         proxies: points that stand for their neighbourhoods.
         group, near: neighbours of a proxy in the grouping, and in the layers that look at neighbours.
         local: channels of the grouping.
-        queries: coarse points; the patches have 16384 / queries points.
+        queries: coarse points, the first half of them predicted; the patches have 16384 / queries points.
         feature: channels of the global feature.
         rebuild: hidden channels of the last perceptron.
     """
@@ -59,6 +60,7 @@ class QueryWidth:
 
 
 QUERY_WIDTHS = {
+    "wide": QueryWidth(256, 8, 4, 6, 2048, 256, 32, 8, (128, 256), 512, 512, 512),
     "edge": QueryWidth(96, 3, 2, 3, 1024, 128, 32, 8, (64, 128), 256, 256, 512),
     "tiny": QueryWidth(16, 2, 1, 1, 128, 32, 8, 4, (16, 32), 64, 32, 64),
 }
@@ -69,7 +71,7 @@ class QueryOptions:
     """Switches.
 
     Args:
-        mirror: candidates mirrored about the estimated plane of symmetry too.
+        mirror: the images of the proxies in the estimated plane of symmetry may be queries too.
         denoise: noisy queries in training.
         trim: percent of the points that do not count at each end of x and of y when the cloud is centred.
     """
@@ -168,7 +170,9 @@ class QueryNetwork(CompletionModel):
         self.place, self.proxy = perceptron(3, 128, channels), perceptron(width.local[1], 2 * channels, channels)
         self.encoder = nn.ModuleList([_Layer(channels, width.heads, n == 0, False) for n in range(width.encoder)])
         self.widen = perceptron(channels, wide, wide)
-        self.coarse = perceptron(wide, wide, 3 * width.queries)
+        self.predicted = width.queries // 2
+        require(width.proxies >= width.queries - self.predicted, "proxies", width.proxies, ">= half of the queries")
+        self.coarse = perceptron(wide, wide, 3 * self.predicted)
         self.score_place, self.score_feature = nn.Linear(6, wide, bias=False), nn.Linear(wide, wide)
         self.score = perceptron(wide, wide // 2, 1)
         self.query_place, self.query_feature = nn.Linear(6, wide, bias=False), nn.Linear(wide, wide)
@@ -200,18 +204,20 @@ class QueryNetwork(CompletionModel):
         require(shape_m.shape == allowed, "start shape", shape_m.shape, str(allowed))
         last = self.coarse[-1]
         assert isinstance(last, nn.Linear)
-        last.bias.copy_((torch.from_numpy(shape_m) / self.scale).flatten())
+        some = torch.from_numpy(shape_m)[:: self.coarse_points // self.predicted]
+        last.bias.copy_((some / self.scale).flatten())
         last.weight.mul_(0.1)
 
     def forward(self, points_m: Tensor, counts: Sequence[int], cells: Tensor | None = None) -> Completion:
         """See ``CompletionModel.forward``; while training also the denoised patches."""
         points, center, _ = self.to_units(points_m, counts)
         cloud, first = shuffled(points, counts, self.width.points)
-        places = take(cloud, spread(cloud, first, self.width.proxies))
+        rows = spread(cloud, first, self.width.proxies)
+        places, new = take(cloud, rows), first.gather(1, rows)
         memory = self._encode(cloud, first, places)
         feature = self.widen(memory).amax(1)
         plane = self._plane(feature) if self.options.mirror else None
-        queries, score = self._queries(feature, places, plane)
+        queries, score = self._queries(feature, places, new, plane)
         noisy = self._noisy(places) if self.training and self.options.denoise else None
         patches, log_sigma = self._decode(queries, score, noisy, memory, places, feature)
         count, shift = self.coarse_points, center[:, None]
@@ -242,22 +248,29 @@ class QueryNetwork(CompletionModel):
     def _plane(self, feature: Tensor) -> Tensor:
         """Unit normal in the plane and offset along it, network units: [b, 3]."""
         with exactly(feature):
-            raw = self.plane(feature.float())
+            raw = self.plane(_wide(feature))
             return torch.cat([functional.normalize(raw[:, :2], dim=1), raw[:, 2:]], 1)
 
-    def _queries(self, feature: Tensor, places: Tensor, plane: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The best candidates [b, q, 6], network units and what each is (one of three is 1), and their scores."""
+    def _queries(self, feature: Tensor, places: Tensor, new: Tensor, plane: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Predicted queries and the best candidates: [b, q, 6], network units and what each is (one of three is 1).
+
+        ``new`` is False for a place that repeats another: it is chosen last. Beside them their scores [b, q, 1], 1 for
+        a predicted one; a score that is multiplied into its token is how the choice is learned.
+        """
         with exactly(feature):
-            wide = feature.float() if feature.dtype == torch.bfloat16 else feature
-            predicted = self.coarse(wide).view(len(feature), self.coarse_points, 3)
+            wide = _wide(feature)
+            predicted = self.coarse(wide).view(len(feature), self.predicted, 3)
             parts = [predicted, places] + ([] if plane is None else [mirrored(places, plane)])
             kinds = torch.eye(3, dtype=places.dtype, device=places.device)
             marked = [torch.cat([part, kind.expand_as(part)], -1) for part, kind in zip(parts, kinds, strict=False)]
-            candidates = torch.cat(marked, 1)
+            candidates = torch.cat(marked[1:], 1)
             hidden = functional.gelu(self.score_place(candidates) + self.score_feature(wide)[:, None])
             score = torch.sigmoid(self.score(hidden))
-        best = score[..., 0].topk(self.coarse_points, dim=1).indices.sort(1).values
-        return take(candidates, best), take(score, best)
+        last = -torch.arange(1, candidates.shape[1] + 1, dtype=score.dtype, device=score.device)
+        rank = torch.where(new.repeat(1, len(marked) - 1), score[..., 0], last)
+        best = rank.topk(self.coarse_points - self.predicted, dim=1).indices.sort(1).values
+        given = torch.ones_like(predicted[..., :1])
+        return torch.cat([marked[0], take(candidates, best)], 1), torch.cat([given, take(score, best)], 1)
 
     def _noisy(self, places: Tensor) -> Tensor:
         """Input points with noise, whose true surroundings the decoder must rebuild: [b, 64, 6]."""
@@ -278,14 +291,21 @@ class QueryNetwork(CompletionModel):
             mask = real[None, :] | ~real[:, None]
             allowed = mask[None]
         with exactly(asked):
-            hidden = functional.gelu(self.query_place(asked) + self.query_feature(feature.float())[:, None])
+            hidden = functional.gelu(self.query_place(asked) + self.query_feature(_wide(feature))[:, None])
         tokens = self.query(hidden) * score
         index = neighbours(asked[..., :3], asked[..., :3], self.width.near, allowed)
         of_memory = neighbours(asked[..., :3], places, self.width.near)
         for layer in self.decoder:
             tokens = layer(tokens, index, mask, memory, of_memory)
-        reduced = self.reduce(torch.cat([tokens, asked[..., :3]], -1)) + self.reduce_feature(feature)[:, None]
+        with exactly(asked):
+            reduced = self.reduce(torch.cat([_wide(tokens), asked[..., :3]], -1))
+        reduced = reduced + self.reduce_feature(feature)[:, None]
         top = self.top(reduced[:, :true].amax(1))
         last = functional.gelu(self.rebuild1(reduced) + top[:, None])
         patches = self.rebuild2(last).view(*asked.shape[:2], self.cells, 3)
         return asked[:, :, None, :3] + patches, self.sigma(last)
+
+
+def _wide(values: Tensor) -> Tensor:
+    """bfloat16 as float32, anything else as it is."""
+    return values.float() if values.dtype == torch.bfloat16 else values
