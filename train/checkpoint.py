@@ -12,6 +12,8 @@ import torch
 
 from edge.errors import ModelError
 
+_EARLIER_NAME = "ours"
+"""Of the network ``narrow``, in older checkpoints."""
 SCHEMA = 1
 
 
@@ -66,10 +68,13 @@ def load_checkpoint(path: Path) -> Checkpoint:
         content = torch.load(path, map_location="cpu", weights_only=True)
         if content.pop("schema") != SCHEMA:
             raise KeyError("schema")
-        return Checkpoint(**content)
+        checkpoint = Checkpoint(**content)
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, ValueError) as error:
         raise ModelError(
             f"{path.name}: not a checkpoint of this trainer ({type(error).__name__})",
             allowed=f"a file written by 'rfconstruct-train fit', schema {SCHEMA}",
             action="name the checkpoint.pt of a run folder",
         ) from error
+    name = checkpoint.settings.get("network", _EARLIER_NAME)
+    checkpoint.settings["network"] = "narrow" if name == _EARLIER_NAME else name
+    return checkpoint

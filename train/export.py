@@ -20,16 +20,17 @@ from train.networks.queries import QueryNetwork
 from train.quantize import with_saturation_probe
 
 INT8_NODES = ("local1", "local2", "fold1_cells", "fold2", "fold3", "sigma_log", "group", "rebuild1", "rebuild2")
-"""Nodes that compute per input point or per fine point on features: nearly all of the time, and fit for eight bits.
-Coordinates, layers of one row and of one row per coarse point stay in float."""
+"""Nodes that compute on features of input points, neighbours, queries or fine points: fit for eight bits. Coordinates,
+attention and layers of one row stay in float."""
 
 
 def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
     """A network as an ONNX graph for one object (opset 21).
 
-    The graph computes in the unit of the input about its centre: scale and centring cost nothing. What does not differ
-    per fine point is computed once per coarse point or once per cloud, the product of the folding's local weight and
-    the encoder's last weight is a constant, and so is the patch term.
+    What does not differ per fine point is computed once per coarse point or once per cloud. Of all but ``queries``
+    (``export_queries``) the graph computes in the unit of the input about its centre, so scale and centring cost
+    nothing; the product of the folding's local weight and the encoder's last weight is a constant, and so is the patch
+    term.
 
     Args:
         network: ``queries``, ``narrow``, ``paper`` or ``pcn`` of ``networks.registry``, with any options.
@@ -37,12 +38,13 @@ def build(network: CompletionModel, classifier: bool = True) -> onnx.ModelProto:
     Returns:
         Model with input ``points`` float32 [n, columns] metres, n >= 1 free, and outputs ``fine`` float32 [fine, 3] and
         ``coarse`` float32 [coarse, 3], in unit and frame of the input; with a classifier ``class_probability`` float32
-        [classes]; with the option ``sigma`` float32 [fine], expected distance of a fine point to the surface.
+        [classes]; with the option ``uncertainty``, and from ``queries``, ``sigma`` float32 [fine], expected distance of
+        a fine point to the surface.
     Raises:
         ModelError: a network of another kind.
     """
     if isinstance(network, QueryNetwork):
-        return QueryBuilder(network).model()
+        return QueryBuilder(network).model(classifier)
     if not isinstance(network, CompletionNetwork):
         raise ModelError(
             "this network has no edge graph",
@@ -244,6 +246,7 @@ class _Builder(Parts):
             self._layer("of_mirror", of_mirror),
             graph.linear(both, self.weights["of_evidence.weight"] / self.scale, None, "of_evidence"),
         ]
+
 
 def example_input(network: CompletionModel, points: int = 64) -> Float32:
     """A cloud of the network's columns, for checks: float32 [points, columns]."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from train.objects.library import Split
 
 _SAMPLES, _EMD_SAMPLES, _BANK = 192, 96, 800
-_CALIBRATION_INPUTS, _GOLDEN_INPUTS, _CALIBRATION_SEED = 96, 8, 7
+_CALIBRATION_INPUTS, _GOLDEN_INPUTS, _CALIBRATION_SEED = 96, 48, 7
 _DATASET = {
     "sight": "true scale, any heading, seen along the line of sight (x) and over the ground (z = 0), both with errors",
     "box": "in the object's own box: heading and centre known, lengths in diagonals of the box",
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     if not checkpoint.step:
         raise ModelError(f"{options.source}: not trained yet", action="train first")
     network = of_checkpoint(checkpoint)
-    model = build(network, classifier=checkpoint.settings.get("network", "narrow") != "paper")
+    model = build(network, classifier=checkpoint.settings["network"] != "paper")
     inputs = calibration_inputs(network, _sets(options, network, "val"))
     target.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as name:
@@ -138,10 +138,12 @@ def _measure(options: argparse.Namespace, checkpoint: Checkpoint, network: Compl
 
 def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) -> dict[str, Any]:
     metrics = ("cd_cm", "accuracy_cm", "completeness_cm", "emd_cm", "f_5cm", "f_10cm", "f_1pct", "class_right")
+    from train.fit_text import starting_point
+
     settings = dict(checkpoint.settings)
     for name in ("start", "teacher"):  # where it lay is nobody's business, which one it was is
         if settings.get(name):
-            settings[name] = f"{Path(settings[name]).parent.name}/{Path(settings[name]).name}"
+            settings[name] = starting_point(settings[name])
     share = settings.get("data", {}).get("simulated_share", 0.0)
     drive_bys = f"; {100 * share:.0f} % simulated drive-bys as the pipeline saw them" if share else ""
     return {
@@ -149,7 +151,7 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
         "samples_before": settings.get("samples_before", 0),
         "seconds": round(checkpoint.elapsed_s),
         "seed": settings["seed"],
-        "network": settings.get("network", "narrow"),
+        "network": settings["network"],
         "width": settings["width"],
         "frame": network.frame,
         "parameters": network.parameter_count,
@@ -166,31 +168,15 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
 
 
 def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, str]:
+    from train.fit_text import fit_command
+
     source, target = options.source.resolve().parent.name, options.name or options.target.name
-    start, data = settings.get("start", ""), settings.get("data", {})
-    more = "".join(f" --option {key}={_plain(value)}" for key, value in settings.get("options", {}).items())
-    more += "" if settings.get("precision", "fp32") == "fp32" else f" --precision {settings['precision']}"
-    root = "runs" if Path(start).suffix == ".pt" else "models"  # of a checkpoint, or of a shipped model
-    names = (Path(start).parent.name, Path(start).name) if root == "runs" else (Path(start).name,)
-    loss = settings.get("loss", {})
-    for name, usual in (("fine_emd", 0.0), ("beta", 0.02)):
-        if loss.get(name, usual) != usual:
-            more += f" --{name.replace('_', '-')} {loss[name]:g}"
-    more += f" --start {'/'.join((root, *names))}" if start else ""
-    if "simulated_share" in data:
-        more += f" --simulated DRIVE_BYS --simulated-share {data['simulated_share']:g}"
     sets = " --simulated DRIVE_BYS" if options.simulated else ""
     sets += f" --confidence {options.confidence.name}" if options.confidence else ""
     given: Callable[[str], str] = lambda name: f"--{name.replace('_', '-')} {getattr(options, name)}"  # noqa: E731
     return {
-        "fit": f"rfconstruct-train fit runs/{source} --network {settings.get('network', 'narrow')} "
-        f"--width {settings['width']} --minutes {settings['budget_s'] / 60:g} --batch {settings['batch']} "
-        f"--rate {settings['rate']:g} --seed {settings['seed']}{more}",
+        "fit": fit_command(source, settings),
         "export": f"rfconstruct-train export runs/{source}/checkpoint.pt models/{target} "
         + " ".join(given(name) for name in ("samples", "emd_samples", "bank"))
         + sets,
     }
-
-
-def _plain(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -26,7 +26,7 @@ class QueryBuilder(Parts):
         self.unit, self.scale = self.scale, np.float32(1)
         self.width, self.count, self.cells = network.width, network.coarse_points, network.cells
 
-    def model(self) -> onnx.ModelProto:
+    def model(self, classifier: bool = True) -> onnx.ModelProto:
         """The whole graph."""
         graph, fine = self.graph, self.count * self.cells
         self._center()
@@ -43,12 +43,14 @@ class QueryBuilder(Parts):
         centers = graph.view("asked_places", [self.count, 1, 3], "patch_centers")
         graph.view(graph.add("Add", [patches, centers], "cells"), [fine, 3], "fine_units")
         self._metres("fine_units", "fine")
-        graph.add("Softmax", [self._perceptron("classifier", "feature")], "softmax", axis=1)
-        graph.view("softmax", [self.network.classes], "class_probability")
+        outputs: dict[str, tuple[int, ...]] = {"fine": (fine, 3), "coarse": (self.count, 3)}
+        if classifier:
+            graph.add("Softmax", [self._perceptron("classifier", "feature")], "softmax", axis=1)
+            graph.view("softmax", [self.network.classes], "class_probability")
+            outputs["class_probability"] = (self.network.classes,)
         bias = self.weights["sigma.bias"] + np.log(self.unit)
         graph.add("Exp", [graph.linear(last, self.weights["sigma.weight"], bias, "sigma_log")], "sigma_cells")
         graph.view("sigma_cells", [fine], "sigma")
-        outputs = {"fine": (fine, 3), "coarse": (self.count, 3), "class_probability": (self.network.classes,)}
         return graph.model({**outputs, "sigma": (fine,)})
 
     def _metres(self, source: str, output: str) -> str:

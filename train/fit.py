@@ -108,7 +108,7 @@ class Trainer:
             kind = "a model's graph"
         else:
             earlier = load_checkpoint(path)
-            weights, kind = earlier.average, earlier.settings.get("network", "narrow")
+            weights, kind = earlier.average, earlier.settings["network"]
             samples = earlier.samples + int(earlier.settings.get("samples_before", 0))
             trim = int(earlier.settings.get("options", {}).get("trim", 0))  # no weight tells
         refusal = ModelError(

@@ -14,6 +14,7 @@ import numpy as np
 
 from edge.completion.confidence import ConfidenceModel
 from edge.completion.manifest import SCHEMA, InputFrame
+from edge.errors import ModelError
 from edge.frames import Float32
 from train.evaluate import OnnxModel
 from train.network import CompletionModel
@@ -24,7 +25,7 @@ FRAMES: dict[str, InputFrame] = {"sight": "line_of_sight", "box": "box"}
 MIN_POINTS, MAX_POINTS = 64, 2048
 """Of an input cloud, as the data sets draw them."""
 _FINE_ROWS = 1024
-_JITTER_M = 1e-5
+_JITTER_M, _LARGEST_CHANGE_M = 1e-5, 0.1
 _LEAST_TOLERANCE_M = {FULL: 1e-3, SMALL: 1e-2}
 """Other processors round otherwise; the last bit of an activation may fall into the next of 255 steps."""
 
@@ -39,12 +40,14 @@ def write_golden(path: Path, models: dict[str, OnnxModel], inputs: Sequence[Floa
     Args:
         path: file to write.
         models: file name -> model.
-        inputs: candidates; a coarse point that lies half-way between two input points may flip from one to the other
-            when another processor rounds otherwise, so the input whose answers change least under a jitter of 10 um is
-            taken.
+        inputs: candidates; what lies half-way between two choices (the nearest input point, the last query that is
+            taken) may flip when another processor rounds otherwise, so the input whose answers change least under a
+            jitter of 10 um is taken.
     Returns:
         File name -> tolerance in metres of the largest coordinate difference: four times that change, and at least
         1 mm (fp32) or 10 mm (int8).
+    Raises:
+        ModelError: even the steadiest answer moves so far that a comparison would say nothing.
     """
     rng = np.random.default_rng(0)
     best, change = inputs[0], dict.fromkeys(models, float("inf"))
@@ -52,6 +55,14 @@ def write_golden(path: Path, models: dict[str, OnnxModel], inputs: Sequence[Floa
         found = {name: _sensitivity(model, points, rng) for name, model in models.items()}
         if sum(found.values()) < sum(change.values()):
             best, change = points, found
+    worst = max(change.values())
+    if not worst <= _LARGEST_CHANGE_M:
+        raise ModelError(
+            f"none of {len(inputs)} inputs has a steady answer",
+            value=f"{worst:.3g} m under a jitter of {1e6 * _JITTER_M:.0f} um",
+            allowed=f"at most {_LARGEST_CHANGE_M:g} m",
+            action="train longer, or give drive-bys with --simulated: more inputs to choose from",
+        )
     count = min(len(model(best)[0]) for model in models.values())
     rows = np.sort(rng.choice(count, min(count, _FINE_ROWS), replace=False))
     content: dict[str, Any] = {"points": best, "fine_rows": rows}

@@ -25,6 +25,8 @@ MARGIN = 0.15
 """Room beyond the calibrated range, in shares of it."""
 BALANCE = 0.5
 """Share of the channels' unequal widths, in logarithms, that goes into the weights: both sides get the same error."""
+_LEAST_SCALE = 1e-6
+"""Of a channel's weights, against the widest one: without weights the code of any bias would be too long."""
 _LEAST_GAIN = 0.02
 """Of a channel, against the widest one."""
 HALF_ELEMENTS = 100_000
@@ -112,6 +114,9 @@ def _bias_of_maxima(
 ) -> dict[str, Float32]:
     """Mean error of what a quantized product gives to a maximum over rows, which rounding errors can only raise."""
     products = {node.output[0]: node.name for node in model.graph.node if node.name in nodes}
+    for node in model.graph.node:
+        if node.op_type == "Reshape" and node.input[0] in products:
+            products[node.output[0]] = products[node.input[0]]
     pairs = [
         (products[node.input[0]], node.output[0])
         for node in model.graph.node
@@ -198,6 +203,7 @@ class _Rewriter:
         weight = self.weights[node.input[1]].astype(np.float64) * source.gain[:, None] / gain
         add, name = self.graph.constant, node.name
         scale = np.maximum(np.abs(weight).max(axis=0), 1e-12) / self.limit
+        scale = np.maximum(scale, _LEAST_SCALE * scale.max())
         bias = self.weights.get(node.input[2])
         if bias is not None:  # its code has 32 bits; of a channel nearly without weights it would need more
             right = (bias - self.errors.get(name, 0.0)) / gain

@@ -226,7 +226,16 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_stopped(
         assert torch.equal(value, leg.average[name]), name
 
 
-@pytest.mark.parametrize(("network", "precision"), [("pcn", "fp32"), ("adapointr", "fp32"), ("narrow", "bf16")])
+@pytest.mark.parametrize(
+    ("network", "precision"),
+    [
+        ("pcn", "fp32"),
+        ("adapointr", "fp32"),
+        ("narrow", "bf16"),
+        ("queries", "fp32"),
+        ("queries", "bf16"),
+    ],
+)
 def test_every_network_trains_and_continues_exactly(
     network: str, precision: str, data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
 ) -> None:

@@ -70,6 +70,14 @@ def test_options_may_be_added_and_samples_are_counted(tmp_path: Path) -> None:
         torch.testing.assert_close(other(cloud, [100]).fine, network(cloud, [100]).fine, atol=1e-4, rtol=0)
 
 
+def test_a_plane_of_symmetry_is_neither_dropped_nor_made_up(tmp_path: Path) -> None:
+    with_plane, without = made("queries", "sight", {}), made("queries", "sight", {"mirror": False})
+    for network, other in ((with_plane, without), (without, with_plane)):
+        export(build(network), tmp_path / FULL)
+        with pytest.raises(ModelError, match=r"mirror|plane"):
+            read_weights(tmp_path, other)
+
+
 def test_another_centre_is_refused_unless_there_was_none(tmp_path: Path) -> None:
     plain, trimmed = made("narrow", "sight", {}), made("narrow", "sight", {"trim": 5})
     export(build(trimmed), tmp_path / FULL)

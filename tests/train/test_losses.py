@@ -175,6 +175,25 @@ def total(output: Completion, truth: Tensor, matcher: Matcher, **changes: object
     return completion_loss(output, truth, torch.tensor([0, 3]), 1.0, settings, matcher, generator).total
 
 
+def test_emd_of_fine_points_is_added_with_its_weight(matcher: Matcher) -> None:
+    """A cloud shifted by less than half its spacing: every point's partner is its own, the EMD is the shift."""
+    axis = torch.linspace(-1, 1, 6)
+    truth = torch.cartesian_prod(axis, axis, axis)[None] * SCALE_M
+    shift = torch.tensor([0.1, 0.0, 0.0]) * SCALE_M
+    count = truth.shape[1]
+    output = Completion(truth, truth + shift, torch.zeros(1, 0))
+    terms = [
+        completion_loss(
+            output, truth, torch.tensor([0]), 1.0, LossSettings(emd_points=count, emd_tolerance=0.01, fine_emd=weight),
+            matcher, torch.Generator().manual_seed(0),
+        )
+        for weight in (0.0, 0.5)
+    ]  # fmt: skip
+    assert float(terms[1].total - terms[0].total) == pytest.approx(0.5 * 0.1, rel=0.02)
+    assert float(terms[1].extra) == pytest.approx(0.5 * 0.1, rel=0.02)
+    assert float(terms[1].coarse) == float(terms[0].coarse)
+
+
 def test_class_weights_weigh_the_samples_of_a_class(matcher: Matcher) -> None:
     output, truth = parts()
     each = [

@@ -47,6 +47,20 @@ def test_quantized_answers_are_near_and_classes_stay(model: onnx.ModelProto, bit
         np.testing.assert_allclose(found.probability, right.probability, atol=0.02)
 
 
+def test_a_channel_without_weights_keeps_its_bias() -> None:
+    """Its code is bias / step, and a step made from no weights would be nothing."""
+    torch.manual_seed(1)
+    network = CompletionNetwork(WIDTHS["tiny"], 4).eval()
+    with torch.no_grad():
+        network.fold2.weight[:4] = 0
+        network.fold2.bias[:4] = 2
+        network.local1.weight[3] = 0
+    float_model = build(network)
+    small = Network(per_object(quantize(float_model, INT8_NODES, CALIBRATION)).SerializeToString(), "int8")
+    right, found = Network(per_object(float_model).SerializeToString(), "fp32").run(cloud(0)), small.run(cloud(0))
+    assert np.sqrt(np.square(found.fine_m - right.fine_m).sum(axis=1).mean()) < 0.02
+
+
 def test_coordinates_never_pass_eight_bits(model: onnx.ModelProto) -> None:
     """Their steps would be centimetres: only the named nodes are quantized, and what they read are features."""
     coded = quantize(model, INT8_NODES, CALIBRATION)

@@ -102,8 +102,6 @@ def build(
 def of_checkpoint(checkpoint: Checkpoint) -> CompletionModel:
     """The trained network of a run, its averaged weights, ready to use on the CPU."""
     settings = checkpoint.settings
-    network = build(
-        settings.get("network", "narrow"), settings["width"], settings.get("frame", "sight"), settings.get("options")
-    )
+    network = build(settings["network"], settings["width"], settings.get("frame", "sight"), settings.get("options"))
     network.load_state_dict(checkpoint.average)
     return network.eval()
