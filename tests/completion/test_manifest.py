@@ -46,7 +46,7 @@ def test_shipped_manifest_is_read() -> None:
     manifest = read_manifest(SHIPPED)
     assert manifest.classes == ("car", "bicycle", "motorcycle", "pedestrian")
     assert (manifest.min_points, manifest.max_points) == (64, 2048)
-    assert (manifest.coarse_points, manifest.fine_points) == (1024, 16384)
+    assert (manifest.coarse_points, manifest.fine_points) == (256, 16384)
     assert {"cascade_pair", "cascade_pair_fine", "cascade_demo"} <= set(manifest.rigs)
     assert manifest.tolerance_m == CONTENT["golden"]["tolerance_m"]
     assert manifest.input_frame == CONTENT["input"]["frame"]
