@@ -149,7 +149,7 @@ class QueryBuilder(Parts):
         return tokens
 
     def _block(self, name: str, tokens: str, near: str, memory: str = "", of_memory: str = "") -> str:
-        """``queries._Layer``: [q, channels] -> [q, channels]."""
+        """``attention.NearLayer``: [q, channels] -> [q, channels]."""
         graph = self.graph
         normal = self._norm(f"{name}.norms.0", tokens, f"{name}.normal")
         tokens = graph.add("Add", [tokens, self._mixed(f"{name}.own", normal, normal, near)], f"{name}.after_own")
@@ -162,7 +162,7 @@ class QueryBuilder(Parts):
         return graph.add("Add", [tokens, self._perceptron(f"{name}.mlp", middle)], f"{name}.out")
 
     def _mixed(self, name: str, own: str, others: str, index: str) -> str:
-        """``queries._Mixed``."""
+        """the attention of ``NearLayer`` and what is beside it."""
         graph = self.graph
         value = self._attend(f"{name}.attention", own, others, self.width.heads)
         if f"{name}.join.weight" not in self.weights:

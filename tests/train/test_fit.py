@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,15 @@ import torch
 from edge.errors import ConfigError, ModelError
 from train.batches import Order, collate, endless, in_frame
 from train.checkpoint import load_checkpoint
+from train.cli import _parser
 from train.dataset import CompletionDataset, DatasetSettings
 from train.distill import DistillSettings
 from train.fit import CHECKPOINT, FitSettings, Trainer, learning_rate
+from train.fit_command import _class_weights
+from train.fit_text import fit_command, starting_point
 from train.losses import LossSettings
 from train.nearest import nearest_distance
-from train.networks.registry import of_checkpoint
+from train.networks.registry import of_checkpoint, parse_options
 from train.perturb_settings import PerturbSettings
 
 DATA = DatasetSettings(truth_points=512, max_points=200, epoch_samples=24, parametric_objects=1, evaluation_views=1)
@@ -363,3 +366,25 @@ def test_two_processes_take_the_steps_of_one_with_the_double_batch(
 def test_shares_of_the_processes_are_the_large_batch() -> None:
     whole, parts = list(Order(23, 6, 1)), [list(Order(23, 3, 1, rank, 2)) for rank in (0, 1)]
     assert [a + b for a, b in zip(*parts, strict=True)] == whole
+
+
+def test_the_command_of_the_card_gives_the_settings_back() -> None:
+    """What the parser makes of it is what the run had; what is usual is not named."""
+    loss = LossSettings(fine_emd=0.25, beta=0.05, emd_points=256, joint=True, class_weights=(1.0, 2.0, 1.0, 1.0))
+    chosen = FitSettings(
+        network="queries", width="edge", options={"trim": 5, "mirror": False}, frame="box", seed=3, steps=70, batch=8,
+        rate=5e-4, cells=8, precision="bf16", start="/elsewhere/models/default", loss=loss,
+    )  # fmt: skip
+    data = {"max_points": 2048, "truth_points": 4096, "simulated_share": 0.6}
+    command = fit_command("own", asdict(chosen) | {"data": data})
+    options = _parser().parse_args(command.split()[1:])
+    for name in ("network", "width", "frame", "seed", "steps", "batch", "rate", "cells", "precision"):
+        assert getattr(options, name) == getattr(chosen, name), name
+    assert parse_options("queries", options.option) == chosen.options
+    assert (options.fine_emd, options.beta, options.emd_points) == (0.25, 0.05, 256)
+    assert options.joint_uncertainty
+    assert not options.squared
+    assert (options.start, options.points, options.simulated_share) == ("models/default", 2048, 0.6)
+    assert _class_weights(options.class_weight) == loss.class_weights
+    assert "truth-points" not in command
+    assert starting_point("/somewhere/runs/first/checkpoint.pt") == "runs/first/checkpoint.pt"

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from edge.config import require
 from edge.frames import Float32
 from train.network import FINE_POINTS, Completion, CompletionModel, Frame, exactly
-from train.networks.attention import Attention, perceptron
+from train.networks.attention import near_layers, perceptron
 from train.networks.neighbours import farthest, fixed, neighbours, take
 
 GROUP, NEAR = 16, 8
@@ -76,6 +76,11 @@ class _Edge(nn.Module):
         return result
 
 
+def _edge(channels: int) -> _Edge:
+    """The edge layer beside an attention."""
+    return _Edge(channels, channels)
+
+
 class _Grouper(nn.Module):
     """Point proxies: two samplings with edge convolutions between; 128 channels."""
 
@@ -103,50 +108,6 @@ class _Grouper(nn.Module):
         return points, feature
 
 
-class _Mixed(nn.Module):
-    """Attention, and with ``near`` a layer over spatial neighbours beside it, joined by a linear layer."""
-
-    def __init__(self, channels: int, heads: int, near: bool) -> None:
-        super().__init__()
-        self.attention = Attention(channels, heads)
-        self.edge = _Edge(channels, channels) if near else None
-        self.join = nn.Linear(2 * channels, channels) if near else None
-
-    def forward(self, own: Tensor, others: Tensor, index: Tensor, mask: Tensor | None = None) -> Tensor:
-        """[b, q, c], [b, p, c], int64 [b, q, k] -> [b, q, c]."""
-        value: Tensor = self.attention(own, others, mask)
-        if self.edge is None or self.join is None:
-            return value
-        joined: Tensor = self.join(torch.cat([value, self.edge(own, others, index)], -1))
-        return joined
-
-
-class _Layer(nn.Module):
-    """Self-attention, in the decoder cross-attention, then a perceptron; normalisation first."""
-
-    def __init__(self, channels: int, heads: int, near: bool, cross: bool) -> None:
-        super().__init__()
-        self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(4 if cross else 2)])
-        self.own = _Mixed(channels, heads, near)
-        self.cross = _Mixed(channels, heads, near) if cross else None
-        self.mlp = perceptron(channels, 2 * channels, channels)
-
-    def forward(
-        self,
-        tokens: Tensor,
-        index: Tensor,
-        mask: Tensor | None = None,
-        memory: Tensor | None = None,
-        of_memory: Tensor | None = None,
-    ) -> Tensor:
-        """Tokens [b, q, c] with their neighbours [b, q, k]; memory [b, m, c] with its own [b, q, k]."""
-        normal = self.norms[0](tokens)
-        tokens = tokens + self.own(normal, normal, index, mask)
-        if self.cross is not None and memory is not None:
-            tokens = tokens + self.cross(self.norms[2](tokens), self.norms[3](memory), of_memory)
-        return tokens + self.mlp(self.norms[1](tokens))  # type: ignore[no-any-return]
-
-
 class AdaPoinTr(CompletionModel):
     """See the module.
 
@@ -164,12 +125,12 @@ class AdaPoinTr(CompletionModel):
         channels, heads, wide = width.channels, width.heads, width.feature
         self.grouper = _Grouper(width.proxies)
         self.place, self.proxy = perceptron(3, 128, channels), perceptron(128, 512, channels)
-        self.encoder = nn.ModuleList([_Layer(channels, heads, n == 0, False) for n in range(width.encoder)])
+        self.encoder = near_layers(width.encoder, channels, heads, _edge)
         self.widen = perceptron(channels, wide, wide)
         self.coarse = perceptron(wide, wide, 3 * width.queries)
         self.score = perceptron(3, 256, 256, 1)
         self.query = perceptron(wide + 3, wide, wide, channels)
-        self.decoder = nn.ModuleList([_Layer(channels, heads, n == 0, True) for n in range(width.decoder)])
+        self.decoder = near_layers(width.decoder, channels, heads, _edge, cross=True)
         self.reduce = nn.Linear(channels + wide + 3, channels)
         self.rebuild = perceptron(2 * channels, 512, 3 * self.cells)
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Multi-head attention and the transformer block around it (Vaswani et al. 2017, normalisation first)."""
+"""Multi-head attention, the transformer block around it (Vaswani et al. 2017), and a layer that sees neighbours too."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -65,3 +67,62 @@ def perceptron(*channels: int) -> nn.Sequential:
     for before, after in pairwise(channels):
         layers += [nn.Linear(before, after), nn.GELU()]
     return nn.Sequential(*layers[:-1])
+
+
+EdgeMaker = Callable[[int], nn.Module]
+"""Channels -> a module (own [b, q, c], others [b, p, c], neighbours int64 [b, q, k]) -> [b, q, c]."""
+
+
+class _Mixed(nn.Module):
+    """Attention, and with ``edge`` a layer over spatial neighbours beside it, joined by a linear layer."""
+
+    def __init__(self, channels: int, heads: int, edge: EdgeMaker | None) -> None:
+        super().__init__()
+        self.attention = Attention(channels, heads)
+        self.edge = edge(channels) if edge else None
+        self.join = nn.Linear(2 * channels, channels) if edge else None
+
+    def forward(self, own: Tensor, others: Tensor, index: Tensor, mask: Tensor | None = None) -> Tensor:
+        """[b, q, c], [b, p, c], int64 [b, q, k] -> [b, q, c]."""
+        value: Tensor = self.attention(own, others, mask)
+        if self.edge is None or self.join is None:
+            return value
+        joined: Tensor = self.join(torch.cat([value, self.edge(own, others, index)], -1))
+        return joined
+
+
+class NearLayer(nn.Module):
+    """Self-attention, in a decoder cross-attention, then a perceptron; normalisation first (Yu et al. 2023).
+
+    Args:
+        channels, heads: of the attention.
+        edge: makes the layer over spatial neighbours beside either attention; None: attention alone.
+        cross: whether the tokens look at a memory too.
+    """
+
+    def __init__(self, channels: int, heads: int, edge: EdgeMaker | None, cross: bool = False) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(4 if cross else 2)])
+        self.own = _Mixed(channels, heads, edge)
+        self.cross = _Mixed(channels, heads, edge) if cross else None
+        self.mlp = perceptron(channels, 2 * channels, channels)
+
+    def forward(
+        self,
+        tokens: Tensor,
+        index: Tensor,
+        mask: Tensor | None = None,
+        memory: Tensor | None = None,
+        of_memory: Tensor | None = None,
+    ) -> Tensor:
+        """Tokens [b, q, c] with their neighbours [b, q, k]; memory [b, m, c] with its own [b, q, k]."""
+        normal = self.norms[0](tokens)
+        tokens = tokens + self.own(normal, normal, index, mask)
+        if self.cross is not None and memory is not None:
+            tokens = tokens + self.cross(self.norms[2](tokens), self.norms[3](memory), of_memory)
+        return tokens + self.mlp(self.norms[1](tokens))  # type: ignore[no-any-return]
+
+
+def near_layers(count: int, channels: int, heads: int, edge: EdgeMaker, cross: bool = False) -> nn.ModuleList:
+    """``count`` layers of which the first sees spatial neighbours beside its attention."""
+    return nn.ModuleList([NearLayer(channels, heads, None if n else edge, cross) for n in range(count)])

@@ -20,7 +20,7 @@ from torch.nn import functional
 from edge.config import require
 from edge.frames import Float32
 from train.network import FINE_POINTS, Completion, CompletionModel, Frame, exactly
-from train.networks.attention import Attention, perceptron
+from train.networks.attention import near_layers, perceptron
 from train.networks.narrow import mirrored
 from train.networks.neighbours import neighbours, take
 from train.networks.sampling import shuffled, spread
@@ -100,50 +100,6 @@ class _Edge(nn.Module):
         return functional.leaky_relu(most + self.own(own), 0.2)
 
 
-class _Mixed(nn.Module):
-    """Attention, and with ``near`` a layer over spatial neighbours beside it, joined by a linear layer."""
-
-    def __init__(self, channels: int, heads: int, near: bool) -> None:
-        super().__init__()
-        self.attention = Attention(channels, heads)
-        self.edge = _Edge(channels) if near else None
-        self.join = nn.Linear(2 * channels, channels) if near else None
-
-    def forward(self, own: Tensor, others: Tensor, index: Tensor, mask: Tensor | None = None) -> Tensor:
-        """[b, q, c], [b, p, c], int64 [b, q, k] -> [b, q, c]."""
-        value: Tensor = self.attention(own, others, mask)
-        if self.edge is None or self.join is None:
-            return value
-        joined: Tensor = self.join(torch.cat([value, self.edge(own, others, index)], -1))
-        return joined
-
-
-class _Layer(nn.Module):
-    """Self-attention, in the decoder cross-attention, then a perceptron; normalisation first."""
-
-    def __init__(self, channels: int, heads: int, near: bool, cross: bool) -> None:
-        super().__init__()
-        self.norms = nn.ModuleList([nn.LayerNorm(channels) for _ in range(4 if cross else 2)])
-        self.own = _Mixed(channels, heads, near)
-        self.cross = _Mixed(channels, heads, near) if cross else None
-        self.mlp = perceptron(channels, 2 * channels, channels)
-
-    def forward(
-        self,
-        tokens: Tensor,
-        index: Tensor,
-        mask: Tensor | None = None,
-        memory: Tensor | None = None,
-        of_memory: Tensor | None = None,
-    ) -> Tensor:
-        """Tokens [b, q, c] with their neighbours [b, q, k]; memory [b, m, c] with its own [b, q, k]."""
-        normal = self.norms[0](tokens)
-        tokens = tokens + self.own(normal, normal, index, mask)
-        if self.cross is not None and memory is not None:
-            tokens = tokens + self.cross(self.norms[2](tokens), self.norms[3](memory), of_memory)
-        return tokens + self.mlp(self.norms[1](tokens))  # type: ignore[no-any-return]
-
-
 class QueryNetwork(CompletionModel):
     """See the module. Order and repetition of the input points hardly matter: they decide which of close points stay.
 
@@ -168,7 +124,7 @@ class QueryNetwork(CompletionModel):
         self.near_point, self.near_center = nn.Linear(3, width.local[0]), nn.Linear(3, width.local[0], bias=False)
         self.group = nn.Linear(*width.local)
         self.place, self.proxy = perceptron(3, 128, channels), perceptron(width.local[1], 2 * channels, channels)
-        self.encoder = nn.ModuleList([_Layer(channels, width.heads, n == 0, False) for n in range(width.encoder)])
+        self.encoder = near_layers(width.encoder, channels, width.heads, _Edge)
         self.widen = perceptron(channels, wide, wide)
         self.predicted = width.queries // 2
         require(width.proxies >= width.queries - self.predicted, "proxies", width.proxies, ">= half of the queries")
@@ -177,7 +133,7 @@ class QueryNetwork(CompletionModel):
         self.score = perceptron(wide, wide // 2, 1)
         self.query_place, self.query_feature = nn.Linear(6, wide, bias=False), nn.Linear(wide, wide)
         self.query = perceptron(wide, wide, channels)
-        self.decoder = nn.ModuleList([_Layer(channels, width.heads, n == 0, True) for n in range(width.decoder)])
+        self.decoder = near_layers(width.decoder, channels, width.heads, _Edge, cross=True)
         self.reduce, self.reduce_feature = nn.Linear(channels + 3, channels), nn.Linear(wide, channels, bias=False)
         self.top = nn.Linear(channels, width.rebuild, bias=False)
         self.rebuild1, self.rebuild2 = nn.Linear(channels, width.rebuild), nn.Linear(width.rebuild, 3 * self.cells)

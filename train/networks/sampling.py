@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from train.network import exactly
+from train.networks.neighbours import fixed
 
 GOLDEN = (5**0.5 - 1) / 2
 
@@ -31,13 +32,9 @@ def shuffled(points: Tensor, counts: Sequence[int], size: int) -> tuple[Tensor, 
     Returns:
         [b, size, 3], and bool [b, size]: False for a point that repeats another.
     """
-    step = torch.tensor(order(size), device=points.device)
-    offset, rows, first = 0, [], []
-    for count in counts:
-        rows.append((step % count if count <= size else step * count // size) + offset)
-        first.append(step < count)
-        offset += count
-    return points[torch.stack(rows)], torch.stack(first)
+    cloud, first = fixed(points, counts, size)
+    rows = torch.tensor(order(size), device=points.device)
+    return cloud[:, rows], first[:, rows]
 
 
 @torch.no_grad()
