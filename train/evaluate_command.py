@@ -37,7 +37,7 @@ def add_verb(verbs: Any) -> None:
     )
     on_a_screen(verb, "MODEL ...")
     verb.add_argument("--split", choices=("val", "test"), default="test")
-    verb.add_argument("--simulated", type=Path, help="data set of simulated drive-bys (folder or file)")
+    verb.add_argument("--simulated", type=Path, action="append", help="set of drive-bys: folder or file; repeatable")
     verb.add_argument(
         "--source", choices=("scans", "drive-bys", "both"), help="default: both where --simulated is given"
     )
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     models = dict(_named(text) for text in options.models)
     require(len(models) == len(options.models), "models", options.models, "different names (NAME=PATH)")
     source = options.source or ("both" if options.simulated else "scans")
-    if source != "scans" and options.simulated is None:
+    if source != "scans" and not options.simulated:
         raise ConfigError("drive-bys are read from a data set", action="give --simulated FOLDER")
     opened = {name: _open(path) for name, path in models.items()}
     command = _command(options)
@@ -253,7 +253,8 @@ def _command(options: argparse.Namespace) -> str:
         words.append(f"{name}={shown}" if "=" in text else shown)
     words += ["--split", options.split]
     if options.simulated:
-        words += ["--simulated", options.simulated.name, *(["--source", options.source] if options.source else [])]
+        words += [word for path in options.simulated for word in ("--simulated", path.name)]
+        words += ["--source", options.source] if options.source else []
     words += ["--samples", str(options.samples), "--emd-samples", str(options.emd_samples), "--bank", str(options.bank)]
     if options.fit_confidence or options.confidence:
         given = options.fit_confidence or options.confidence

@@ -39,7 +39,7 @@ def add_verb(verbs: argparse._SubParsersAction[Any]) -> None:
     verb.add_argument("target", type=Path, help="model folder, for example models/default")
     verb.add_argument("--name", default="", help="of the model; the folder's name by default")
     verb.add_argument("--rig", action="append", help="rig the model fits; may be repeated (cascade_pair)")
-    verb.add_argument("--simulated", type=Path, help="data set of drive-bys: calibrate and gate int8 on it, too")
+    verb.add_argument("--simulated", type=Path, action="append", help="drive-bys: calibrate and gate int8 on them, too")
     verb.add_argument("--confidence", type=Path, help="calibrated confidence (JSON of evaluate) for the manifest")
     verb.add_argument("--weight-bits", type=int, choices=(7, 8), default=8, help="7: int8 saturates on no processor")
     verb.add_argument("--samples", type=int, default=_SAMPLES, help="held-out samples")
@@ -87,7 +87,7 @@ def _sets(options: argparse.Namespace, network: CompletionModel, split: Split) -
 
     settings = DatasetSettings.default(box_frame=network.frame == "box")
     sets = [CompletionDataset(split, settings, _CALIBRATION_SEED if split == "val" else 0)]
-    if options.simulated is not None:
+    if options.simulated:
         sets.append(SimulatedDataset(options.simulated, split, settings, 0))
     return sets
 

@@ -14,7 +14,7 @@ from train.objects.mesh import CLASSES
 
 _VALUES = ("rate", "cells", "average", "precision")
 """Settings of the same name as their option that are named where they are not the usual ones."""
-_LOSS = {"emd_points": "emd-points", "fine_emd": "fine-emd", "beta": "beta"}
+_LOSS = {"emd_points": "emd-points", "fine_emd": "fine-emd", "coarse_emd": "coarse-emd", "beta": "beta"}
 _SWITCHES = {"squared": "squared", "joint": "joint-uncertainty"}
 _DATA = {"max_points": "points", "truth_points": "truth-points"}
 

@@ -130,7 +130,11 @@ class Joined(Sequence[Case]):
 
 
 def held_out(
-    source: Source, split: Split, box_frame: bool = False, simulated: Path | None = None, seed: int = 0
+    source: Source,
+    split: Split,
+    box_frame: bool = False,
+    simulated: Path | Sequence[Path] | None = None,
+    seed: int = 0,
 ) -> HeldOut:
     """Cases of a source with the project's object library.
 
@@ -138,7 +142,7 @@ def held_out(
         source: scans need no file; drive-bys need ``simulated``, a data set or a file of clouds.
         split: "val" or "test".
         box_frame: the setting with box priors.
-        simulated: where the drive-bys are.
+        simulated: where the drive-bys are; several sets are taken together.
         seed: of the scans and of the errors of the line of sight.
     Raises:
         RecordingError: no such set, or no cloud of this split in it.

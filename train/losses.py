@@ -20,6 +20,7 @@ from train.nearest import nearest_index
 from train.network import SCALE_M, Completion, CompletionModel
 from train.networks.narrow import mirrored
 from train.networks.neighbours import neighbours, take
+from train.networks.sampling import spread
 from train.objects.mesh import CLASSES
 
 RAMP = ((0.0, 0.1), (0.1, 0.5), (0.3, 1.0))
@@ -39,6 +40,8 @@ class LossSettings:
         emd_points: random points of both clouds that are matched.
         emd_tolerance: relative excess over the optimal matching that is accepted.
         fine_emd: weight of the EMD of as many random fine points.
+        coarse_emd: where the coarse cloud has the Chamfer distance, weight of its EMD to as many well spread true
+            points. Every coarse point carries as many fine ones: this is what spreads them over the whole surface.
         beta: weight of the cross entropy.
         gamma: weight of the expected distance's log-likelihood, where the network gives one.
         joint: let that term move the points too (heteroscedastic Chamfer distance); else it only learns to expect.
@@ -53,6 +56,7 @@ class LossSettings:
     emd_points: int = 512
     emd_tolerance: float = 0.05
     fine_emd: float = 0.0
+    coarse_emd: float = 0.0
     beta: float = 0.02
     gamma: float = 0.002
     joint: bool = False
@@ -63,7 +67,7 @@ class LossSettings:
     def __post_init__(self) -> None:
         require(1 <= self.emd_points <= 1024, "loss.emd_points", self.emd_points, "1..1024")
         require(0 < self.emd_tolerance < 1, "loss.emd_tolerance", self.emd_tolerance, "0..1")
-        for name in ("fine_emd", "beta", "gamma", "symmetry", "denoise"):
+        for name in ("fine_emd", "coarse_emd", "beta", "gamma", "symmetry", "denoise"):
             require(getattr(self, name) >= 0, f"loss.{name}", getattr(self, name), ">= 0")
         good = len(self.class_weights) in (0, len(CLASSES)) and all(weight > 0 for weight in self.class_weights)
         require(good, "loss.class_weights", self.class_weights, f"{len(CLASSES)} numbers > 0, or none")
@@ -142,6 +146,12 @@ def chamfer(prediction: Tensor, truth: Tensor, matcher: Matcher, squared: bool =
     return _joined(*two_ways(prediction, truth, matcher, squared), squared).mean()
 
 
+def of_patches(first: Tensor, second: Tensor) -> Tensor:
+    """Chamfer distance of many small clouds [n, p, 3] and [n, q, 3] about the origin: [n]; all pairs are compared."""
+    forth, back = (neighbours(*pair, 1)[..., 0] for pair in ((first.detach(), second), (second, first.detach())))
+    return _joined(_length(first - take(second, forth), False), _length(take(first, back) - second, False), False)
+
+
 def _joined(forth: Tensor, back: Tensor, squared: bool) -> Tensor:
     """Chamfer distance of every sample from its two directions: [b]."""
     return (forth.mean(1) + back.mean(1)) * (1.0 if squared else 0.5)
@@ -165,13 +175,21 @@ def _some_matched(
     return _matched(points[:, chosen], truth[:, :count], matcher, settings.emd_tolerance, settings.squared)
 
 
+def _spread_matched(coarse: Tensor, truth: Tensor, settings: LossSettings, matcher: Matcher) -> Tensor:
+    """EMD of a coarse cloud and as many well spread points of the truth (of a random four times as many): [b]."""
+    count = min(coarse.shape[1], truth.shape[1])
+    some = truth[:, : 4 * count]
+    chosen = take(some, spread(some, torch.ones_like(some[..., 0], dtype=torch.bool), count))
+    return _matched(coarse[:, :count], chosen, matcher, settings.emd_tolerance, settings.squared)
+
+
 @dataclass(frozen=True, slots=True)
 class LossTerms:
     """One step's losses; distances in network units.
 
     Args:
         total: what is differentiated.
-        coarse: EMD, or Chamfer distance where the network asks for it.
+        coarse: EMD, or where the network asks for it Chamfer distance, with the weighted EMD.
         fine: Chamfer distance.
         label: cross entropy, 0 without a classifier.
         extra: weighted sum of the EMD of fine points, and of what only some networks have: expected distance, plane of
@@ -213,6 +231,8 @@ def completion_loss(
     weights = settings.weights(labels)
     if network and network.coarse_loss == "chamfer":
         coarse_loss = _joined(*two_ways(coarse, truth, matcher, settings.squared), settings.squared)
+        if settings.coarse_emd:
+            coarse_loss = coarse_loss + settings.coarse_emd * _spread_matched(coarse, truth, settings, matcher)
     else:
         coarse_loss = _some_matched(coarse, truth, settings, matcher, generator)
     forth, back = two_ways(fine, truth, matcher, settings.squared)
@@ -245,7 +265,7 @@ def _extra(
     if output.denoised is not None:
         centers, patches = (part / scale for part in output.denoised)
         own = take(truth, neighbours(centers, truth, min(patches.shape[2], truth.shape[1])))
-        apart = torch.linalg.vector_norm(patches[:, :, :, None] - own[:, :, None] + _TINY, dim=-1)
-        each = (apart.amin(3).mean((1, 2)) + apart.amin(2).mean((1, 2))) / 2
+        here = (patches - centers[:, :, None]).flatten(0, 1)  # small numbers: nothing cancels
+        each = of_patches(here, (own - centers[:, :, None]).flatten(0, 1)).view(len(centers), -1).mean(1)
         total = total + settings.denoise * each
     return total

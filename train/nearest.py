@@ -56,13 +56,14 @@ def nearest(query: Float32, target: Float32, index: NDArray[np.int32]) -> None:
         fill[home[i]] += 1
     center = np.empty(3, np.int64)
     columns = np.ascontiguousarray(target.T)
+    sorted_by_cell = target[order]
     for q in range(query.shape[0]):
         outside = np.float32(0)
         for axis in range(3):
             inside = min(max(query[q, axis], low[axis]), high[axis])
             outside += (query[q, axis] - inside) ** 2
             center[axis] = min(size[axis] - 1, int((inside - low[axis]) / cell))
-        index[q] = _near(query[q], target, order, start, size, center, cell, outside)
+        index[q] = _near(query[q], sorted_by_cell, order, start, size, center, cell, outside)
         if index[q] < 0:
             index[q] = _far(query[q, 0], query[q, 1], query[q, 2], columns)
 
@@ -89,20 +90,22 @@ def _near(
         for x in range(max(0, center[0] - r), min(size[0] - 1, center[0] + r) + 1):
             for y in range(max(0, center[1] - r), min(size[1] - 1, center[1] + r) + 1):
                 face = abs(x - center[0]) == r or abs(y - center[1]) == r
-                step = 1 if face or r == 0 else 2 * r
-                for z in range(center[2] - r, center[2] + r + 1, step):
-                    if z < 0 or z >= size[2]:
-                        continue
-                    code = (x * size[1] + y) * size[2] + z
-                    for k in range(start[code], start[code + 1]):
-                        i = order[k]
-                        dx = point[0] - target[i, 0]
-                        dy = point[1] - target[i, 1]
-                        dz = point[2] - target[i, 2]
+                column = (x * size[1] + y) * size[2]
+                low, high = max(0, center[2] - r), min(size[2] - 1, center[2] + r)
+                for part in range(1 if face or r == 0 else 2):  # a face's cells follow each other
+                    first, last = low, high
+                    if not face and r > 0:
+                        first = last = center[2] + (2 * part - 1) * r
+                        if first < 0 or first >= size[2]:
+                            continue
+                    for k in range(start[column + first], start[column + last + 1]):
+                        dx = point[0] - target[k, 0]
+                        dy = point[1] - target[k, 1]
+                        dz = point[2] - target[k, 2]
                         distance = dx * dx + dy * dy + dz * dz
                         if distance < best:
                             best = distance
-                            found = i
+                            found = order[k]
     return -1
 
 

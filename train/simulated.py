@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -47,7 +48,7 @@ class SimulatedDataset(CompletionDataset):
     drive-by at times, where these lay about the object that the other one saw.
 
     Args:
-        source: folder of a data set, or file of clouds.
+        source: folder of a data set, or file of clouds; or several, whose clouds are taken together.
         split, settings, seed: as in ``CompletionDataset``.
         share: chance of a simulated cloud in train, where its class has any.
     Raises:
@@ -55,12 +56,20 @@ class SimulatedDataset(CompletionDataset):
         RecordingError: no readable set, or none of its clouds can be used here.
     """
 
-    def __init__(self, source: Path, split: Split, settings: DatasetSettings, seed: int, share: float = 0.5) -> None:
+    def __init__(
+        self,
+        source: Path | Sequence[Path],
+        split: Split,
+        settings: DatasetSettings,
+        seed: int,
+        share: float = 0.5,
+    ) -> None:
         require(0 <= share <= 1, "dataset.simulated_share", share, "0..1")
         super().__init__(split, settings, seed)
         self.share = share
-        shards = read_clouds(source)
-        self.identity = shards[0].identity
+        sets = [read_clouds(one) for one in ([source] if isinstance(source, Path) else source)]
+        shards = [shard for one in sets for shard in one]
+        self.identity = "+".join(one[0].identity for one in sets)
         self._sizes_m = {name: info.size_m for shard in shards for name, info in shard.objects.items()}
         mine = [c for shard in shards for c in shard.clouds if shard.objects[c.object].split == split and _usable(c)]
         here = {name: _is_here(name, settings.objects_dir) for name in {cloud.object for cloud in mine}}
@@ -72,7 +81,7 @@ class SimulatedDataset(CompletionDataset):
         self._of_label = [[c for c in enough if c.object.startswith(f"{name}/")] for name in CLASSES]
         if not enough:
             raise RecordingError(
-                f"{source}: no cloud can be used for {split}",
+                f"{_names(source)}: no cloud can be used for {split}",
                 value=f"{len(mine)} clouds of {len(here)} objects, {len(self.absent)} of these not on this machine",
                 action="set RFCONSTRUCT_DATA to the folder that holds objects/, or make a larger set",
             )
@@ -184,6 +193,10 @@ class SimulatedDataset(CompletionDataset):
                 action="use the object library that the set was made with",
             )
         return mesh
+
+
+def _names(source: Path | Sequence[Path]) -> str:
+    return str(source) if isinstance(source, Path) else ", ".join(map(str, source))
 
 
 def _foot(truth: Float32) -> Float32:

@@ -22,7 +22,7 @@ def test_counts_of_the_paper() -> None:
 
 
 def test_recipes_that_come_with_the_software() -> None:
-    assert {"equal", "paper", "reference"} <= set(known_recipes())
+    assert {"approach", "equal", "paper", "reference"} <= set(known_recipes())
     for name in known_recipes():
         load_recipe(name)
     assert load_recipe("reference").set.objects * load_recipe("reference").set.drive_bys == 3200

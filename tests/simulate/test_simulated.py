@@ -207,6 +207,19 @@ def test_a_packed_file_serves_as_well(folder: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(packed[index].partial, whole[index].partial)
 
 
+def test_several_sets_are_one(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    build(small_plan(objects=8, drive_bys=2, seed=5), other, Here(), fake_cloud)
+    for split in ("train", "val"):
+        both = SimulatedDataset([folder, other], split, EXACT, 0)  # type: ignore[arg-type]
+        parts = [SimulatedDataset(one, split, EXACT, 0) for one in (folder, other)]  # type: ignore[arg-type]
+        assert [cloud.seed for cloud in both.clouds] == [cloud.seed for part in parts for cloud in part.clouds]
+        assert all(part.identity in both.identity for part in parts)
+    assert len(both) == sum(len(part) for part in parts)
+    with pytest.raises(RecordingError, match=f"{folder}, {other}: no cloud"):
+        SimulatedDataset([folder, other], "val", replace(EXACT, min_points=500), 0)
+
+
 def test_objects_that_are_not_on_this_machine_are_left_out(folder: Path, tmp_path: Path) -> None:
     def rename(shard: Shard) -> Shard:
         return replace(

@@ -370,7 +370,9 @@ def test_shares_of_the_processes_are_the_large_batch() -> None:
 
 def test_the_command_of_the_card_gives_the_settings_back() -> None:
     """What the parser makes of it is what the run had; what is usual is not named."""
-    loss = LossSettings(fine_emd=0.25, beta=0.05, emd_points=256, joint=True, class_weights=(1.0, 2.0, 1.0, 1.0))
+    loss = LossSettings(
+        fine_emd=0.25, coarse_emd=0.125, beta=0.05, emd_points=256, joint=True, class_weights=(1.0, 2.0, 1.0, 1.0)
+    )
     chosen = FitSettings(
         network="queries", width="edge", options={"trim": 5, "mirror": False}, frame="box", seed=3, steps=70, batch=8,
         rate=5e-4, cells=8, precision="bf16", start="/elsewhere/models/default", loss=loss,
@@ -381,7 +383,7 @@ def test_the_command_of_the_card_gives_the_settings_back() -> None:
     for name in ("network", "width", "frame", "seed", "steps", "batch", "rate", "cells", "precision"):
         assert getattr(options, name) == getattr(chosen, name), name
     assert parse_options("queries", options.option) == chosen.options
-    assert (options.fine_emd, options.beta, options.emd_points) == (0.25, 0.05, 256)
+    assert (options.fine_emd, options.coarse_emd, options.beta, options.emd_points) == (0.25, 0.125, 0.05, 256)
     assert options.joint_uncertainty
     assert not options.squared
     assert (options.start, options.points, options.simulated_share) == ("models/default", 2048, 0.6)

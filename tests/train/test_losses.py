@@ -20,6 +20,7 @@ from train.auction_batched import assign_batched
 from train.losses import LossSettings, Matcher, alpha, chamfer, completion_loss, emd, nearest_blocks
 from train.nearest import nearest_distance
 from train.network import SCALE_M, Completion
+from train.networks.registry import build
 
 
 def surface(rng: np.random.Generator, points: int, size: tuple[float, float, float] = (2.2, 0.9, 0.7)) -> Float32:
@@ -192,6 +193,26 @@ def test_emd_of_fine_points_is_added_with_its_weight(matcher: Matcher) -> None:
     assert float(terms[1].total - terms[0].total) == pytest.approx(0.5 * 0.1, rel=0.02)
     assert float(terms[1].extra) == pytest.approx(0.5 * 0.1, rel=0.02)
     assert float(terms[1].coarse) == float(terms[0].coarse)
+
+
+def test_coarse_emd_is_added_with_its_weight_and_wants_the_whole_surface(matcher: Matcher) -> None:
+    """As many true points as coarse ones: all are matched. A coarse cloud that covers one half is a half away."""
+    network = build("queries", "tiny", "sight", {})
+    axis = torch.linspace(-1, 1, 8)
+    truth = torch.cartesian_prod(axis, axis, torch.zeros(1))[None] * SCALE_M
+    shifted = truth + torch.tensor([0.1, 0.0, 0.0]) * SCALE_M
+    crowded = truth * torch.tensor([0.5, 1.0, 1.0]) - torch.tensor([0.5, 0.0, 0.0]) * SCALE_M
+    for coarse, expected, rel in ((shifted, 0.1, 0.02), (crowded, 0.5, 0.05)):
+        terms = [
+            completion_loss(
+                Completion(coarse, coarse, torch.zeros(1, 0)), truth, torch.tensor([0]), 1.0,
+                LossSettings(emd_points=64, emd_tolerance=0.01, coarse_emd=weight),
+                matcher, torch.Generator().manual_seed(0), network,
+            )
+            for weight in (0.0, 0.5)
+        ]  # fmt: skip
+        assert float(terms[1].total - terms[0].total) == pytest.approx(0.5 * expected, rel=rel)
+        assert float(terms[1].coarse - terms[0].coarse) == pytest.approx(0.5 * expected, rel=rel)
 
 
 def test_class_weights_weigh_the_samples_of_a_class(matcher: Matcher) -> None:

@@ -19,7 +19,7 @@ from edge.config import require
 from edge.frames import Float32
 from train.network import FINE_POINTS, Completion, CompletionModel, Frame, exactly
 from train.networks.attention import near_layers, perceptron
-from train.networks.neighbours import farthest, fixed, neighbours, take
+from train.networks.neighbours import farthest, fixed, most_of_groups, neighbours, take
 
 GROUP, NEAR = 16, 8
 """Neighbours in the grouping and in the geometry-aware layers."""
@@ -72,8 +72,7 @@ class _Edge(nn.Module):
         mine = own[:, :, None].expand_as(near)
         value = self.layer(torch.cat([near - mine, mine], -1))
         value = self.activation(self.norm(value.flatten(1, 2).transpose(1, 2)).transpose(1, 2))
-        result: Tensor = value.reshape(*index.shape, value.shape[-1]).amax(2)
-        return result
+        return most_of_groups(value.reshape(*index.shape, value.shape[-1]))
 
 
 def _edge(channels: int) -> _Edge:

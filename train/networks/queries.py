@@ -22,7 +22,7 @@ from edge.frames import Float32
 from train.network import FINE_POINTS, Completion, CompletionModel, Frame, exactly
 from train.networks.attention import near_layers, perceptron
 from train.networks.narrow import mirrored
-from train.networks.neighbours import neighbours, take
+from train.networks.neighbours import most_of_groups, most_of_neighbours, neighbours, take
 from train.networks.sampling import shuffled, spread
 
 DENOISED, JITTER = 64, 0.02
@@ -96,7 +96,7 @@ class _Edge(nn.Module):
 
     def forward(self, own: Tensor, others: Tensor, index: Tensor) -> Tensor:
         """[b, q, c], [b, p, c], int64 [b, q, k] -> [b, q, c]."""
-        most = take(self.other(others), index).amax(2)  # the activation rises, so the maximum may come before it
+        most = most_of_neighbours(self.other(others), index)  # the activation rises, so the maximum may come before it
         return functional.leaky_relu(most + self.own(own), 0.2)
 
 
@@ -195,7 +195,7 @@ class QueryNetwork(CompletionModel):
         with exactly(cloud):
             hidden = take(self.near_point(cloud), index) - self.near_center(places)[:, :, None]
             where = self.place(places)
-        tokens: Tensor = self.proxy(functional.relu(self.group(functional.relu(hidden)).amax(2))) + where
+        tokens: Tensor = self.proxy(functional.relu(most_of_groups(self.group(functional.relu(hidden))))) + where
         near = neighbours(places, places, self.width.near)
         for layer in self.encoder:
             tokens = layer(tokens, near)

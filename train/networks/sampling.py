@@ -63,7 +63,9 @@ def _spread(points: Tensor, first: Tensor, count: int) -> Tensor:
     later = torch.full((size, size), float("inf"), dtype=points.dtype, device=points.device).triu()
     others = norms + torch.where(first, 0.0, float("inf")).to(points.dtype)
     own = torch.cat([-2 * points, torch.ones_like(norms)[..., None]], -1)
-    nearest = torch.baddbmm(later, own, torch.cat([points, others[..., None]], -1).mT).amin(2) + norms
+    other = torch.cat([points, others[..., None]], -1).mT
+    # one cloud after the other: size x size distances fit into the cache, those of a batch do not
+    nearest = torch.stack([torch.addmm(later, *pair).amin(1) for pair in zip(own, other, strict=True)]) + norms
     last = -torch.arange(1, size + 1, dtype=points.dtype, device=points.device)
     nearest = torch.where(first, nearest, last)
     return nearest.topk(count, dim=1).indices.sort(1).values
