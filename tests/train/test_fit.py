@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -323,12 +324,12 @@ def test_a_teacher_pulls_the_student(data: tuple[CompletionDataset, CompletionDa
 
 
 WORKER = """
-import sys, torch
+import json, sys, torch
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_fit import DATA, SETTINGS, CompletionDataset, Trainer, replace
 if __name__ == "__main__":
-    settings = replace(SETTINGS, batch=2, steps=3)
+    settings = replace(SETTINGS, batch=2, steps=3, **json.loads(sys.argv[3]))
     data = CompletionDataset("train", DATA, 0), CompletionDataset("val", DATA, 0)
     trainer = Trainer(settings, *data, Path(sys.argv[1]))
     trainer.run()
@@ -340,18 +341,20 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.parametrize("chosen", [{}, {"network": "queries", "options": {"denoise": False}}])
 def test_two_processes_take_the_steps_of_one_with_the_double_batch(
-    data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path
+    data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path, chosen: dict[str, Any]
 ) -> None:
     (tmp_path / "worker.py").write_text(WORKER)
     run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    arguments = [str(tmp_path / "worker.py"), str(tmp_path / "two"), str(Path(__file__).parent)]
+    arguments = [str(tmp_path / "worker.py"), str(tmp_path / "two"), str(Path(__file__).parent), json.dumps(chosen)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     result = subprocess.run(
         [*run, *arguments], env=environment, capture_output=True, text=True, timeout=250, check=False
     )
     assert result.returncode == 0, result.stderr[-3000:]
-    one = Trainer(replace(SETTINGS, batch=4, steps=3), *data, tmp_path / "one")
+    settings = replace(SETTINGS, batch=4, **chosen)
+    one = Trainer(replace(settings, steps=3), *data, tmp_path / "one")
     one.run()
     two = load_checkpoint(tmp_path / "two" / CHECKPOINT)
     assert (two.step, two.samples, two.settings["batch"]) == (3, 12, 4)
@@ -359,7 +362,7 @@ def test_two_processes_take_the_steps_of_one_with_the_double_batch(
         torch.testing.assert_close(two.model[name], value, atol=2e-4, rtol=0)
     assert two.history[-1]["cd_macro_cm"] == pytest.approx(one.state.history[-1]["cd_macro_cm"], rel=0.01)
     assert len((tmp_path / "two" / "log.jsonl").read_text().splitlines()) == 1
-    continued = Trainer(replace(SETTINGS, batch=4, steps=5), *data, tmp_path / "two", resume=True)
+    continued = Trainer(replace(settings, steps=5), *data, tmp_path / "two", resume=True)
     assert continued.run()[-1]["samples"] == 20
 
 

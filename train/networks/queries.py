@@ -25,8 +25,8 @@ from train.networks.narrow import mirrored
 from train.networks.neighbours import most_of_groups, most_of_neighbours, neighbours, take
 from train.networks.sampling import shuffled, spread
 
-DENOISED, JITTER = 64, 0.02
-"""Noisy queries in training, and the standard deviation of their noise in network units."""
+DENOISED_SHARE, JITTER = 8, 0.02
+"""Queries for each noisy one in training, as published, and the standard deviation of its noise in network units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,8 +229,8 @@ class QueryNetwork(CompletionModel):
         return torch.cat([marked[0], take(candidates, best)], 1), torch.cat([given, take(score, best)], 1)
 
     def _noisy(self, places: Tensor) -> Tensor:
-        """Input points with noise, whose true surroundings the decoder must rebuild: [b, 64, 6]."""
-        chosen = places[:, :DENOISED]
+        """Input points with noise, whose true surroundings the decoder must rebuild: [b, q / 8, 6]."""
+        chosen = places[:, : self.width.queries // DENOISED_SHARE]
         kind = torch.tensor([0.0, 1.0, 0.0], dtype=places.dtype, device=places.device)
         return torch.cat([chosen + JITTER * torch.randn_like(chosen), kind.expand_as(chosen)], -1)
 
