@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from edge.config import require
 from edge.errors import ConfigError, ModelError
 from train.batches import Batch, collate, endless, in_frame
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -71,6 +72,8 @@ class Trainer:
         self.device = self.group.device
         torch.manual_seed(settings.seed)
         network = build(settings.network, settings.width, settings.frame, settings.options)
+        both = settings.loss.coarse_emd == 0 or network.coarse_loss == "chamfer"
+        require(both, "loss.coarse_emd", settings.loss.coarse_emd, f"0: the coarse loss of {settings.network} is EMD")
         self.teacher: Teacher | None = None
         if settings.teacher:
             self.teacher = Teacher(Path(settings.teacher), network, self.device, settings.distill)

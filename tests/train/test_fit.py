@@ -366,6 +366,11 @@ def test_two_processes_take_the_steps_of_one_with_the_double_batch(
     assert continued.run()[-1]["samples"] == 20
 
 
+def test_a_useless_weight_is_refused(data: tuple[CompletionDataset, CompletionDataset], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"coarse_emd.*of narrow is EMD"):
+        Trainer(replace(SETTINGS, loss=LossSettings(emd_points=128, coarse_emd=0.1)), *data, tmp_path)
+
+
 def test_shares_of_the_processes_are_the_large_batch() -> None:
     whole, parts = list(Order(23, 6, 1)), [list(Order(23, 3, 1, rank, 2)) for rank in (0, 1)]
     assert [a + b for a, b in zip(*parts, strict=True)] == whole

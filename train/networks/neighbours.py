@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batched point-set operations in plain torch: a fixed number of points, farthest-point sampling, k neighbours."""
+"""Batched point-set operations: fixed number of points, farthest-point sampling, neighbours and maxima over them."""
 
 from __future__ import annotations
 
