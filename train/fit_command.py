@@ -43,8 +43,8 @@ def add_verb(verbs: Any) -> None:
     fit.add_argument("--average", type=float, default=0.999, help="decay of the averaged weights")
     fit.add_argument("--emd-points", type=int, default=512, help="points that are matched")
     fit.add_argument("--fine-emd", type=float, default=0.0, metavar="W", help="weight of the EMD of random fine points")
-    spread = "weight of the EMD of the coarse cloud, beside its Chamfer distance (queries, adapointr)"
-    fit.add_argument("--coarse-emd", type=float, default=0.0, metavar="W", help=spread)
+    coarse = "weight of the EMD of the coarse points (queries, adapointr)"
+    fit.add_argument("--coarse-emd", type=float, default=0.0, metavar="W", help=coarse)
     fit.add_argument("--beta", type=float, default=0.02, help="weight of the cross entropy of the classes")
     fit.add_argument("--seed", type=int, default=0)
     fit.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
@@ -63,7 +63,7 @@ def add_verb(verbs: Any) -> None:
 def _add_what(fit: argparse.ArgumentParser) -> None:
     """Which network and which data."""
     fit.add_argument("--network", default="queries", help="queries, narrow, paper, pcn or adapointr")
-    widths = "queries: edge, wide, tiny; narrow, paper, pcn: edge, paper, wide, tiny; adapointr: full, small, tiny"
+    widths = "edge, wide, tiny; paper too for narrow, paper, pcn; full, small, tiny for adapointr"
     fit.add_argument("--width", default="", help=widths)
     fit.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="of the network; repeatable")
     fit.add_argument("--frame", choices=("sight", "box"), default="sight", help="line of sight in metres, or box prior")
@@ -71,7 +71,7 @@ def _add_what(fit: argparse.ArgumentParser) -> None:
     fit.add_argument(
         "--simulated", type=Path, action="append", help="folder or file of simulated clouds to mix in; repeatable"
     )
-    fit.add_argument("--simulated-share", type=float, default=0.5, help="of the training samples")
+    fit.add_argument("--simulated-share", type=float, default=0.5, metavar="SHARE", help="of the training samples")
     fit.add_argument("--points", type=int, default=_POINTS, help="of a training input at most")
     fit.add_argument("--truth-points", type=int, default=_TRUTH, help="of a training truth")
 
