@@ -296,7 +296,7 @@ def _load(entry: Entry) -> Mesh:
     return entry.load()
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)
 def _ridden(entry: Entry, objects_dir: Path | None, human: bool, number: int) -> Mesh:
     """A library two-wheeler with a rider, without where nothing on it looks like a saddle and a bar (0.4 MB each)."""
     ref = ObjectRef(CLASSES[entry.label], entry.name, rider=f"{'human' if human else 'rider'}{number}")

@@ -222,7 +222,7 @@ def _is_here(name: str, objects_dir: Path | None) -> bool:
         return False
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=2048)
 def _mesh(name: str, objects_dir: Path | None) -> Mesh:
     """An object, kept in memory (some 200 kB each)."""
     return ObjectRef.from_text(name).mesh(objects_dir)
