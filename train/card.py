@@ -124,4 +124,8 @@ def _precision(scores: dict[str, Scores], files: dict[str, str]) -> str:
             f"| `{file}` | {precision} | {one.summary('cd_cm').mean:.3f} | {accuracy:.3f} | {shift:.2f} | "
             f"{float(np.median(one.values['time_ms'])):.0f} |"
         )
+    lines.append(
+        "\nThe shift compares points of the same number. Where rounding makes a network choose other points of the "
+        "input to build about, other points bear a number, on the same surface: the CD tells."
+    )
     return "\n".join(lines)

@@ -249,11 +249,10 @@ def _command(options: argparse.Namespace) -> str:
     words = ["rfconstruct-train", "evaluate"]
     for text in options.models:
         name, path = _named(text)
-        shown = path.as_posix() if not path.is_absolute() else f".../{path.name}"
-        words.append(f"{name}={shown}" if "=" in text else shown)
+        words.append(f"{name}={_shown(path)}" if "=" in text else _shown(path))
     words += ["--split", options.split]
     if options.simulated:
-        words += [word for path in options.simulated for word in ("--simulated", path.name)]
+        words += [word for path in options.simulated for word in ("--simulated", _shown(path))]
         words += ["--source", options.source] if options.source else []
     words += ["--samples", str(options.samples), "--emd-samples", str(options.emd_samples), "--bank", str(options.bank)]
     if options.fit_confidence or options.confidence:
@@ -262,4 +261,9 @@ def _command(options: argparse.Namespace) -> str:
     for name in ("robustness", "gallery", "seed"):
         if value := getattr(options, name):
             words += [f"--{name}", str(value)]
+    words += [word for name in options.coarse for word in ("--coarse", name)]
     return shlex.join(words)
+
+
+def _shown(path: Path) -> str:
+    return path.as_posix() if not path.is_absolute() else f".../{path.name}"

@@ -155,7 +155,7 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
         "width": settings["width"],
         "frame": network.frame,
         "parameters": network.parameter_count,
-        "device": f"{settings['device']} ({platform.machine()}, {settings['threads']} threads, other work beside it)",
+        "device": f"{settings['device']} ({platform.machine()}, {settings['threads']} threads)",
         "dataset": "Partial clouds made from meshes on the fly (visible surface, holes, noise spheres, ghosts), "
         f"{_DATASET[network.frame]}; simulated geometry{drive_bys}, no radar recording",
         "settings": settings,
@@ -168,15 +168,15 @@ def _training(checkpoint: Checkpoint, network: CompletionModel, scores: Scores) 
 
 
 def _commands(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, str]:
-    from train.fit_text import fit_command
+    from train.fit_text import drive_bys, fit_command
 
     source, target = options.source.resolve().parent.name, options.name or options.target.name
-    sets = " --simulated DRIVE_BYS" if options.simulated else ""
-    sets += f" --confidence {options.confidence.name}" if options.confidence else ""
+    more = drive_bys(len(options.simulated)) if options.simulated else []
+    more += [f"--confidence {options.confidence.name}"] if options.confidence else []
+    more += [f"--rig {rig}" for rig in options.rig or []]
     given: Callable[[str], str] = lambda name: f"--{name.replace('_', '-')} {getattr(options, name)}"  # noqa: E731
     return {
         "fit": fit_command(source, settings),
         "export": f"rfconstruct-train export runs/{source}/checkpoint.pt models/{target} "
-        + " ".join(given(name) for name in ("samples", "emd_samples", "bank"))
-        + sets,
+        + " ".join([*(given(name) for name in ("samples", "emd_samples", "bank")), *more]),
     }

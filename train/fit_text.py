@@ -38,6 +38,11 @@ def starting_point(path: str) -> str:
     return f"models/{where.parent.name if where.suffix == '.onnx' else where.name}"
 
 
+def drive_bys(count: int) -> list[str]:
+    """The options that name sets of drive-bys, whose places are nobody's business."""
+    return [f"--simulated DRIVE_BYS{number or ''}" for number in (range(1, count + 1) if count > 1 else (0,))]
+
+
 def _options(settings: Mapping[str, Any]) -> Iterator[str]:
     usual, loss, data = asdict(FitSettings()), settings.get("loss", {}), settings.get("data", {})
     usual_loss, usual_data = asdict(LossSettings()), {"max_points": 1024, "truth_points": 4096}
@@ -58,7 +63,8 @@ def _options(settings: Mapping[str, Any]) -> Iterator[str]:
         yield "--data pcn"
     yield from (f"--{n} {starting_point(settings[n])}" for n in ("start", "teacher") if settings.get(n))
     if "simulated_share" in data:
-        yield f"--simulated DRIVE_BYS --simulated-share {data['simulated_share']:g}"
+        yield " ".join(drive_bys(1 + str(data.get("simulated_set", "")).count("+")))
+        yield f"--simulated-share {data['simulated_share']:g}"
 
 
 def _plain(value: object) -> str:

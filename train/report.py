@@ -103,6 +103,8 @@ def markdown(part: Part, command: str, folder: Path | None = None) -> str:
         "All predictors, macro mean:",
         _all(part),
         table(part.scores, [(name, name, MACRO) for name in part.scores], columns),
+        "All predictors by class:",
+        _by_class(part, groups),
         _notes(part),
         *_calibration(main),
         *_worst(main),
@@ -136,6 +138,21 @@ def _all(part: Part) -> str:
         cells.append(f"{float(np.median(scores.values['time_ms'])):.0f}" if model else "–")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _by_class(part: Part, groups: Sequence[str]) -> str:
+    """Both head metrics of every predictor in every class."""
+    names = dict(_UNIT)
+    lines = []
+    for metric in part.head:
+        chosen = {name: scores for name, scores in part.scores.items() if scores.measured(metric)}
+        if not chosen:
+            continue
+        lines += ["", f"| {names[metric]} | " + " | ".join(groups) + " |", "|---" * (len(groups) + 1) + "|"]
+        for name, scores in chosen.items():
+            cells = [f"{scores.summary(metric, g).mean:.2f}" if scores.measured(metric, g) else "–" for g in groups]
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines[1:])
 
 
 def _ratio(main: Scores, other: Scores, metric: str) -> str:

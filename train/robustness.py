@@ -22,7 +22,7 @@ class Level:
 
     Args:
         name, unit, level: of the degradation.
-        cases: to which it applies.
+        cases: to which it applies; 0: none has so many frames or points, and the figures are NaN.
         untouched_cm, cd_cm: mean Chamfer distance of these cases before and after.
         untouched_confidence, confidence: the same of the confidence; NaN where the predictor gives none.
         named: share whose class is not "unknown".
@@ -64,8 +64,7 @@ def robustness(predictor: Predictor, cases: Sequence[Case], seed: int = 0, threa
                 changed = [_changed(degradation, level, case, known, seed) for case in known]
                 rows = [row for row, case in enumerate(changed) if case is not None]
                 after = list(pool.map(ask, [case for case in changed if case is not None]))
-                if rows:
-                    lines.append(_line(degradation, level, [before[row] for row in rows], after))
+                lines.append(_line(degradation, level, [before[row] for row in rows], after))
     return lines
 
 
@@ -79,6 +78,8 @@ def _line(
     before: Sequence[tuple[float, float, float]],
     after: Sequence[tuple[float, float, float]],
 ) -> Level:
+    if not after:
+        return Level(degradation.name, degradation.unit, level, 0, *[float("nan")] * 5)
     untouched, changed = np.array(before).mean(axis=0), np.array(after).mean(axis=0)
     figures = (float(v) for v in (untouched[0], changed[0], untouched[1], changed[1], changed[2]))
     return Level(degradation.name, degradation.unit, level, len(after), *figures)
@@ -110,6 +111,9 @@ def robustness_table(levels: Sequence[Level]) -> str:
     ]
     for one in levels:
         level = f"{one.level:.0%}" if one.unit == "share" else f"{one.level:g} {one.unit}"
+        if not one.cases:
+            lines.append(f"| {one.name} | {level} | none has so many | – | – | – |")
+            continue
         lines.append(
             f"| {one.name} | {level} | {one.cases} | {one.untouched_cm:.1f} → {one.cd_cm:.1f} | "
             f"{one.untouched_confidence:.2f} → {one.confidence:.2f} | {one.named:.0%} |"

@@ -14,7 +14,7 @@ from edge.frames import Float32
 from train.dataset import Sample
 from train.degrade import DEGRADATIONS, worsened
 from train.evaluate import FLOOR, Scores, measure
-from train.evaluate_command import _named
+from train.evaluate_command import _named, _shown
 from train.gallery import calibration_picture, case_row, drawn, gallery
 from train.held_out import Case
 from train.objects.mesh import Mesh
@@ -112,7 +112,14 @@ def test_the_report_says_what_was_measured(part: Part) -> None:
     assert content["summaries"]["net"]["cd_cm"]["macro"]["mean"] == pytest.approx(mean)
     assert content["summaries"]["net"]["class_right"]["car"]["mean"] == 1
     assert len(content["samples"]["other"]["objects"]) == 8
-    assert "points" in robustness_table(part.levels)
+    by_class = text.partition("All predictors by class:")[2]
+    car = part.scores["net"].summary("cd_cm", "car").mean
+    assert f"| net | {car:.2f} |" in by_class
+    assert "| other | 0.00 |" in by_class
+    table = robustness_table(part.levels)
+    assert "| points | 1024 points | none has so many | – | – | – |" in table  # the clouds have 400
+    assert "| points | 256 points | 2 | " in table
+    assert "nan" not in table.lower()
 
 
 def test_calibration_of_a_constant_promise(part: Part) -> None:
@@ -164,3 +171,8 @@ def test_models_have_names() -> None:
     assert _named("PCN=runs/a/checkpoint.pt") == ("PCN", Path("runs/a/checkpoint.pt"))
     assert _named("runs/a/checkpoint.pt")[0] == "a"
     assert _named("models/default")[0] == "default"
+
+
+def test_commands_show_no_place_of_a_machine() -> None:
+    assert _shown(Path("out/equal400")) == "out/equal400"
+    assert _shown(Path("/somewhere/private/equal400")) == ".../equal400"

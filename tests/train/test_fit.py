@@ -385,7 +385,7 @@ def test_the_command_of_the_card_gives_the_settings_back() -> None:
         network="queries", width="edge", options={"trim": 5, "mirror": False}, frame="box", seed=3, steps=70, batch=8,
         rate=5e-4, cells=8, precision="bf16", start="/elsewhere/models/default", loss=loss,
     )  # fmt: skip
-    data = {"max_points": 2048, "truth_points": 4096, "simulated_share": 0.6}
+    data = {"max_points": 2048, "truth_points": 4096, "simulated_share": 0.6, "simulated_set": "a+b"}
     command = fit_command("own", asdict(chosen) | {"data": data})
     options = _parser().parse_args(command.split()[1:])
     for name in ("network", "width", "frame", "seed", "steps", "batch", "rate", "cells", "precision"):
@@ -396,5 +396,5 @@ def test_the_command_of_the_card_gives_the_settings_back() -> None:
     assert not options.squared
     assert (options.start, options.points, options.simulated_share) == ("models/default", 2048, 0.6)
     assert _class_weights(options.class_weight) == loss.class_weights
-    assert "truth-points" not in command
+    assert ("truth-points" in command, len(options.simulated)) == (False, 2)
     assert starting_point("/somewhere/runs/first/checkpoint.pt") == "runs/first/checkpoint.pt"
