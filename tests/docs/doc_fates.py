@@ -37,6 +37,7 @@ ELSEWHERE: tuple[tuple[str, str, str], ...] = (
     ("", r"rfconstruct-train bench", "tests/simulate/test_simulate_bench.py"),
     ("", r"rfconstruct-train fit", "tests/train/test_fit.py"),
     ("", r"rfconstruct-train evaluate", "tests/train/test_evaluate.py"),
+    ("", r"rfconstruct-train export", "tests/train/test_export.py"),
 )
 """Page (empty: any), command, and the test that runs that command or verb."""
 
