@@ -61,6 +61,10 @@ class Group:
                 dist.broadcast(tensor, 0)
 
     def close(self) -> None:
-        """Leave the group, when all have come here."""
+        """Leave the group, when all have come here: the first process may still be validating and writing.
+
+        Python must not end while a thread of gloo lets go of a tensor: it would abort, and ``torchrun`` end the others.
+        """
         if self.size > 1 and dist.is_initialized():
+            dist.barrier()
             dist.destroy_process_group()
