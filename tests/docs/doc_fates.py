@@ -35,7 +35,7 @@ ELSEWHERE: tuple[tuple[str, str, str], ...] = (
     ("", r"rfconstruct-train rig", "tests/simulate/test_virtual_rig.py"),
     ("", r"rfconstruct-train bench-completion", "tests/train/test_bench_completion.py"),
     ("", r"rfconstruct-train bench", "tests/simulate/test_simulate_bench.py"),
-    ("", r"rfconstruct-train fit", "tests/train/test_fit.py"),
+    ("", r"rfconstruct-train fit|torchrun .*train.cli fit", "tests/train/test_fit.py"),
     ("", r"rfconstruct-train evaluate", "tests/train/test_evaluate.py"),
     ("", r"rfconstruct-train export", "tests/train/test_export.py"),
 )
