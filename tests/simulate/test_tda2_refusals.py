@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,7 @@ from tda2_captures import (
 )
 from tda2_host import ACK, NACK, Host
 
-from train.simulate.cascade_chip import ChipDelays
+from train.simulate.cascade_chip import SOP_FUNCTIONAL, CascadeChip, ChipDelays
 from train.simulate.tda2_board import Tda2Board
 
 
@@ -325,3 +325,23 @@ def test_hardware_trigger(make: Make) -> None:
         board.pulse()
         host.event(1, 0x100F)
     assert board.bursts == 3
+
+
+def test_firmware_is_reported_once_however_late_its_answers_are() -> None:
+    """What the second-last chunk sets in motion may come after the last chunk was taken."""
+    waiting: list[Callable[[], None]] = []
+    chip = CascadeChip(
+        0, "", ChipDelays(answer_s=1e-3), None, lambda _, action: waiting.append(action), lambda: None, lambda _: None,
+        lambda _: None,
+    )  # fmt: skip
+    chip.sop = SOP_FUNCTIONAL
+    chip.reset()
+    image = struct.pack("<II", 0, 7936) + b"MSTR" + bytes(7932)
+    for index in range(35):
+        block = (0x4080, image[232 * index : 232 * (index + 1)])
+        chip.receive(h.rhcp(5, 0x204, index % 16, [block], 34 - index))
+    while waiting:
+        waiting.pop(0)()
+    reports = [message for message in chip.outbox if struct.pack("<H", 0x5005) in message]
+    assert len(chip.outbox) == 1 + 35 + 1  # power-up, answers, boot status
+    assert len(reports) == 1

@@ -218,7 +218,8 @@ class CascadeChip:
                 replies.append(SubBlock(block.identity, reply))
         self._answer(header, Kind.RESPONSE, tuple(replies))
         for block in blocks:
-            self._after(self._delays.answer_s, partial(self._follow, block))
+            if block.identity != c.FILE or c.FILE in self._done:  # of a file the last chunk alone
+                self._after(self._delays.answer_s, partial(self._follow, block))
 
     def _require(self, block: int) -> None:
         needed = c.NEEDS.get(block, ())
@@ -284,7 +285,7 @@ class CascadeChip:
 
     def _follow(self, block: SubBlock) -> None:
         """What an accepted command sets in motion, after its answer."""
-        if block.identity == c.FILE and c.FILE in self._done:
+        if block.identity == c.FILE:
             self._event(c.BOOT_STATUS, bytes(24))
         elif block.identity == c.RF_POWER:
             self._after(self._delays.rf_power_up_s, lambda: self._event(c.RF_POWER_UP, bytes(32)))
