@@ -245,7 +245,7 @@ def _in_box(predictor: Predictor) -> bool:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """The command that repeats this, without where it writes; paths outside this folder by their names only."""
+    """The command that repeats this, without where it writes; see ``_shown``."""
     words = ["rfconstruct-train", "evaluate"]
     for text in options.models:
         name, path = _named(text)
@@ -257,7 +257,7 @@ def _command(options: argparse.Namespace) -> str:
     words += ["--samples", str(options.samples), "--emd-samples", str(options.emd_samples), "--bank", str(options.bank)]
     if options.fit_confidence or options.confidence:
         given = options.fit_confidence or options.confidence
-        words += ["--fit-confidence" if options.fit_confidence else "--confidence", given.name]
+        words += ["--fit-confidence" if options.fit_confidence else "--confidence", _shown(given)]
     for name in ("robustness", "gallery", "seed"):
         if value := getattr(options, name):
             words += [f"--{name}", str(value)]
@@ -266,4 +266,5 @@ def _command(options: argparse.Namespace) -> str:
 
 
 def _shown(path: Path) -> str:
+    """A path inside this folder as it is, of any other the name only."""
     return path.as_posix() if not path.is_absolute() else f".../{path.name}"

@@ -39,7 +39,7 @@ def starting_point(path: str) -> str:
 
 
 def drive_bys(count: int) -> list[str]:
-    """The options that name sets of drive-bys, whose places are nobody's business."""
+    """The options that name sets of drive-bys, DRIVE_BYS or DRIVE_BYS1, DRIVE_BYS2, ... for their places."""
     return [f"--simulated DRIVE_BYS{number or ''}" for number in (range(1, count + 1) if count > 1 else (0,))]
 
 

@@ -22,7 +22,7 @@ class Level:
 
     Args:
         name, unit, level: of the degradation.
-        cases: to which it applies; 0: none has so many frames or points, and the figures are NaN.
+        cases: to which it applies; 0: none has the frames or points for it, and the figures are NaN.
         untouched_cm, cd_cm: mean Chamfer distance of these cases before and after.
         untouched_confidence, confidence: the same of the confidence; NaN where the predictor gives none.
         named: share whose class is not "unknown".
@@ -112,7 +112,7 @@ def robustness_table(levels: Sequence[Level]) -> str:
     for one in levels:
         level = f"{one.level:.0%}" if one.unit == "share" else f"{one.level:g} {one.unit}"
         if not one.cases:
-            lines.append(f"| {one.name} | {level} | none has so many | – | – | – |")
+            lines.append(f"| {one.name} | {level} | 0 | – | – | – |")
             continue
         lines.append(
             f"| {one.name} | {level} | {one.cases} | {one.untouched_cm:.1f} → {one.cd_cm:.1f} | "

@@ -117,7 +117,7 @@ def test_the_report_says_what_was_measured(part: Part) -> None:
     assert f"| net | {car:.2f} |" in by_class
     assert "| other | 0.00 |" in by_class
     table = robustness_table(part.levels)
-    assert "| points | 1024 points | none has so many | – | – | – |" in table  # the clouds have 400
+    assert "| points | 1024 points | 0 | – | – | – |" in table  # the clouds have 400
     assert "| points | 256 points | 2 | " in table
     assert "nan" not in table.lower()
 
